@@ -1,0 +1,1 @@
+"""Vectorised corridor environment and PPO / PPO-LSTM. Knows sim_gateway (world, physics, LiDAR) and policy_export."""
