@@ -39,12 +39,12 @@ class NetworkConfig(BaseModel):
 
     memory: Literal["lstm", "none"] = "lstm"
     preprocessing: Literal["shaped", "channels"] = "shaped"
-    beams: int = Field(180, gt=0, le=4096)
-    beam_group: int = Field(5, gt=0)
-    range_max_m: float = Field(4.0, gt=0.0)
-    vehicle_radius_m: float = Field(0.35, gt=0.0)
-    hidden_size: int = Field(128, gt=0, le=4096)
-    head_size: int = Field(64, gt=0, le=4096)
+    beams: int = Field(default=180, gt=0, le=4096)
+    beam_group: int = Field(default=5, gt=0)
+    range_max_m: float = Field(default=4.0, gt=0.0)
+    vehicle_radius_m: float = Field(default=0.35, gt=0.0)
+    hidden_size: int = Field(default=128, gt=0, le=4096)
+    head_size: int = Field(default=64, gt=0, le=4096)
     feature_skip: bool = True
     initial_log_std: float = -0.5
     action_low: tuple[float, float, float, float] = (-0.5, -0.5, -0.5, -1.0)
