@@ -18,48 +18,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim_gateway.vehicle_params import (
-    GRAVITY_M_S2,
-    P_ACC_CUTOFF_HZ,
-    P_ARM_X,
-    P_ARM_Y,
-    P_ATT_P_PITCH,
-    P_ATT_P_ROLL,
-    P_ATT_P_YAW,
-    P_DGYRO_CUTOFF_HZ,
-    P_DRAG_ANGULAR,
-    P_DRAG_LINEAR,
-    P_DRAG_QUADRATIC,
-    P_HOVER_THRUST,
-    P_IXX,
-    P_IYY,
-    P_IZZ,
-    P_MASS,
-    P_MOTOR_LAG,
-    P_MOTOR_THRUST_MAX,
-    P_RATE_D_XY,
-    P_RATE_D_Z,
-    P_RATE_I_XY,
-    P_RATE_I_Z,
-    P_RATE_MAX_XY,
-    P_RATE_MAX_Z,
-    P_RATE_P_XY,
-    P_RATE_P_Z,
-    P_TAN_TILT_MAX,
-    P_THRUST_MIN,
-    P_VEL_D_XY,
-    P_VEL_D_Z,
-    P_VEL_I_XY,
-    P_VEL_I_Z,
-    P_VEL_MAX_DOWN,
-    P_VEL_MAX_UP,
-    P_VEL_MAX_XY,
-    P_VEL_P_XY,
-    P_VEL_P_Z,
-    P_YAW_MOMENT,
-    P_YAW_SETPOINT_AGE,
-    VehicleParams,
-)
+from sim_gateway import vehicle_params as vp
+from sim_gateway.vehicle_params import GRAVITY_M_S2, VehicleParams
 
 STEP_S = 0.004
 
@@ -110,10 +70,10 @@ def reset_state(state: Row, params: Row, x_m: float, y_m: float, z_m: float, yaw
     state[QUAT], state[QUAT + 3] = math.cos(0.5 * yaw_rad), math.sin(0.5 * yaw_rad)
     state[BODY_Z_SP + 2] = 1.0
     if flying:
-        trim = params[P_MASS] * GRAVITY_M_S2 / (4.0 * params[P_MOTOR_THRUST_MAX])
+        trim = params[vp.MASS] * GRAVITY_M_S2 / (4.0 * params[vp.MOTOR_THRUST_MAX])
         state[MOTOR : MOTOR + 4] = trim
         state[THRUST_SP] = trim
-        state[VEL_INT + 2] = GRAVITY_M_S2 * (trim / params[P_HOVER_THRUST] - 1.0)
+        state[VEL_INT + 2] = GRAVITY_M_S2 * (trim / params[vp.HOVER_THRUST] - 1.0)
     else:
         state[POS + 2] = 0.0
         state[LANDED] = 1.0
@@ -128,7 +88,7 @@ def step_velocity(
     `velocity_sp`, `wind`: world m/s [3]. `yaw_rate_sp`: rad/s, counter-clockwise. `estimate_error`: m/s [3], added to the
     true velocity to give the one the controller flies on. On the ground, a climb setpoint takes off and any other idles.
     """
-    motor_gain = 1.0 - math.exp(-STEP_S / params[P_MOTOR_LAG])
+    motor_gain = 1.0 - math.exp(-STEP_S / params[vp.MOTOR_LAG])
     for _ in range(n_steps):
         if state[PHASE] <= 0.0:
             _velocity_loop(state, params, velocity_sp, estimate_error)
@@ -142,7 +102,7 @@ def step_velocity(
 @njit(cache=True, error_model="numpy")
 def step_motors_off(state: Row, params: Row, wind: Row, n_steps: int) -> None:
     """Advance `n_steps` of 4 ms with the motors commanded off (disarmed or terminated), in place."""
-    motor_gain = 1.0 - math.exp(-STEP_S / params[P_MOTOR_LAG])
+    motor_gain = 1.0 - math.exp(-STEP_S / params[vp.MOTOR_LAG])
     _reset_controller(state)
     for _ in range(n_steps):
         for i in range(4):
@@ -200,20 +160,20 @@ def _velocity_loop(state: Row, params: Row, velocity_sp: Row, estimate_error: Ro
     if state[LANDED] > 0.0 and velocity_sp[2] < _TAKEOFF_MIN_M_S:
         _reset_controller(state)
         return
-    gain = dt / (dt + 1.0 / (2.0 * math.pi * params[P_ACC_CUTOFF_HZ]))
+    gain = dt / (dt + 1.0 / (2.0 * math.pi * params[vp.ACC_CUTOFF_HZ]))
     for i in range(3):
         state[ACC_LP + i] += gain * (state[ACC + i] - state[ACC_LP + i])
     speed_xy = math.sqrt(velocity_sp[0] * velocity_sp[0] + velocity_sp[1] * velocity_sp[1])
-    scale = params[P_VEL_MAX_XY] / speed_xy if speed_xy > params[P_VEL_MAX_XY] else 1.0
-    climb = min(params[P_VEL_MAX_UP], max(-params[P_VEL_MAX_DOWN], velocity_sp[2]))
+    scale = params[vp.VEL_MAX_XY] / speed_xy if speed_xy > params[vp.VEL_MAX_XY] else 1.0
+    climb = min(params[vp.VEL_MAX_UP], max(-params[vp.VEL_MAX_DOWN], velocity_sp[2]))
     error_x = scale * velocity_sp[0] - state[VEL] - estimate_error[0]
     error_y = scale * velocity_sp[1] - state[VEL + 1] - estimate_error[1]
     error_z = climb - state[VEL + 2] - estimate_error[2]
     if state[LANDED] > 0.0:
         error_x, error_y = 0.0, 0.0
-    acc_x = params[P_VEL_P_XY] * error_x + state[VEL_INT] - params[P_VEL_D_XY] * state[ACC_LP]
-    acc_y = params[P_VEL_P_XY] * error_y + state[VEL_INT + 1] - params[P_VEL_D_XY] * state[ACC_LP + 1]
-    acc_z = params[P_VEL_P_Z] * error_z + state[VEL_INT + 2] - params[P_VEL_D_Z] * state[ACC_LP + 2]
+    acc_x = params[vp.VEL_P_XY] * error_x + state[VEL_INT] - params[vp.VEL_D_XY] * state[ACC_LP]
+    acc_y = params[vp.VEL_P_XY] * error_y + state[VEL_INT + 1] - params[vp.VEL_D_XY] * state[ACC_LP + 1]
+    acc_z = params[vp.VEL_P_Z] * error_z + state[VEL_INT + 2] - params[vp.VEL_D_Z] * state[ACC_LP + 2]
 
     thrust_x, thrust_y, thrust_z = _thrust_vector(params, acc_x, acc_y, acc_z)
     thrust = math.sqrt(thrust_x * thrust_x + thrust_y * thrust_y + thrust_z * thrust_z)
@@ -221,28 +181,28 @@ def _velocity_loop(state: Row, params: Row, velocity_sp: Row, estimate_error: Ro
     state[THRUST_SP] = thrust
 
     # stop the vertical integrator at saturation; bleed the horizontal one by what could not be produced
-    if (thrust_z <= params[P_THRUST_MIN] and error_z < 0.0) or (thrust_z >= 1.0 and error_z > 0.0):
+    if (thrust_z <= params[vp.THRUST_MIN] and error_z < 0.0) or (thrust_z >= 1.0 and error_z > 0.0):
         error_z = 0.0
-    to_acc = GRAVITY_M_S2 / params[P_HOVER_THRUST]
+    to_acc = GRAVITY_M_S2 / params[vp.HOVER_THRUST]
     made_x, made_y = thrust_x * to_acc, thrust_y * to_acc
     if acc_x * acc_x + acc_y * acc_y > made_x * made_x + made_y * made_y:
-        error_x -= 2.0 / params[P_VEL_P_XY] * (acc_x - made_x)
-        error_y -= 2.0 / params[P_VEL_P_XY] * (acc_y - made_y)
-    state[VEL_INT] += params[P_VEL_I_XY] * error_x * dt
-    state[VEL_INT + 1] += params[P_VEL_I_XY] * error_y * dt
-    state[VEL_INT + 2] = min(GRAVITY_M_S2, max(-GRAVITY_M_S2, state[VEL_INT + 2] + params[P_VEL_I_Z] * error_z * dt))
+        error_x -= 2.0 / params[vp.VEL_P_XY] * (acc_x - made_x)
+        error_y -= 2.0 / params[vp.VEL_P_XY] * (acc_y - made_y)
+    state[VEL_INT] += params[vp.VEL_I_XY] * error_x * dt
+    state[VEL_INT + 1] += params[vp.VEL_I_XY] * error_y * dt
+    state[VEL_INT + 2] = min(GRAVITY_M_S2, max(-GRAVITY_M_S2, state[VEL_INT + 2] + params[vp.VEL_I_Z] * error_z * dt))
 
 
 @njit(cache=True, error_model="numpy")
 def _thrust_vector(params: Row, acc_x: float, acc_y: float, acc_z: float) -> tuple[float, float, float]:
     """Acceleration setpoint to normalised thrust vector: tilt limited, then full thrust shared with the vertical first."""
-    hover = params[P_HOVER_THRUST]
+    hover = params[vp.HOVER_THRUST]
     # direction from horizontal acceleration and gravity alone (MPC_ACC_DECOUPLE), so the tilt limit is a limit on it
     lean = math.sqrt(acc_x * acc_x + acc_y * acc_y) / GRAVITY_M_S2
-    shrink = params[P_TAN_TILT_MAX] / lean if lean > params[P_TAN_TILT_MAX] else 1.0
+    shrink = params[vp.TAN_TILT_MAX] / lean if lean > params[vp.TAN_TILT_MAX] else 1.0
     tan_x, tan_y = shrink * acc_x / GRAVITY_M_S2, shrink * acc_y / GRAVITY_M_S2
     cos_tilt = 1.0 / math.sqrt(1.0 + tan_x * tan_x + tan_y * tan_y)
-    collective = max((acc_z / GRAVITY_M_S2 + 1.0) * hover / cos_tilt, params[P_THRUST_MIN])
+    collective = max((acc_z / GRAVITY_M_S2 + 1.0) * hover / cos_tilt, params[vp.THRUST_MIN])
     thrust_z = collective * cos_tilt
     thrust_xy = thrust_z * math.sqrt(tan_x * tan_x + tan_y * tan_y)
     kept_xy = min(thrust_xy, _XY_THRUST_MARGIN)
@@ -264,17 +224,18 @@ def _attitude_and_rate_loops(state: Row, params: Row, yaw_rate_sp: float) -> tup
     aim_y = 2.0 * (x * y - w * z) * bx + (1.0 - 2.0 * (x * x + z * z)) * by + up_y * bz
     aim_z = 2.0 * (x * z + w * y) * bx + 2.0 * (y * z - w * x) * by + up_z * bz
     half_cos = math.sqrt(max(1e-6, 0.5 * (1.0 + aim_z)))  # reduced attitude error: 2 sin(angle / 2) about aim's axis
-    rate_x = -params[P_ATT_P_ROLL] * aim_y / half_cos + up_x * yaw_rate_sp
-    rate_y = params[P_ATT_P_PITCH] * aim_x / half_cos + up_y * yaw_rate_sp
-    rate_z = up_z * yaw_rate_sp - params[P_ATT_P_YAW] * params[P_YAW_SETPOINT_AGE] * state[OMEGA + 2]
-    limit_xy, limit_z = params[P_RATE_MAX_XY], params[P_RATE_MAX_Z]
-    gain = STEP_S / (STEP_S + 1.0 / (2.0 * math.pi * params[P_DGYRO_CUTOFF_HZ]))
+    rate_x = -params[vp.ATT_P_ROLL] * aim_y / half_cos + up_x * yaw_rate_sp
+    rate_y = params[vp.ATT_P_PITCH] * aim_x / half_cos + up_y * yaw_rate_sp
+    rate_z = up_z * yaw_rate_sp - params[vp.ATT_P_YAW] * params[vp.YAW_SETPOINT_AGE] * state[OMEGA + 2]
+    limit_xy, limit_z = params[vp.RATE_MAX_XY], params[vp.RATE_MAX_Z]
+    gain = STEP_S / (STEP_S + 1.0 / (2.0 * math.pi * params[vp.DGYRO_CUTOFF_HZ]))
     for i in range(3):
         state[ALPHA_LP + i] += gain * (state[ALPHA + i] - state[ALPHA_LP + i])
+    p_xy, i_xy, d_xy = params[vp.RATE_P_XY], params[vp.RATE_I_XY], params[vp.RATE_D_XY]
     return (
-        _rate_pid(state, 0, min(limit_xy, max(-limit_xy, rate_x)), params[P_RATE_P_XY], params[P_RATE_I_XY], params[P_RATE_D_XY]),
-        _rate_pid(state, 1, min(limit_xy, max(-limit_xy, rate_y)), params[P_RATE_P_XY], params[P_RATE_I_XY], params[P_RATE_D_XY]),
-        _rate_pid(state, 2, min(limit_z, max(-limit_z, rate_z)), params[P_RATE_P_Z], params[P_RATE_I_Z], params[P_RATE_D_Z]),
+        _rate_pid(state, 0, min(limit_xy, max(-limit_xy, rate_x)), p_xy, i_xy, d_xy),
+        _rate_pid(state, 1, min(limit_xy, max(-limit_xy, rate_y)), p_xy, i_xy, d_xy),
+        _rate_pid(state, 2, min(limit_z, max(-limit_z, rate_z)), params[vp.RATE_P_Z], params[vp.RATE_I_Z], params[vp.RATE_D_Z]),
     )
 
 
@@ -287,12 +248,12 @@ def _rate_pid(state: Row, axis: int, rate_sp: float, p_gain: float, i_gain: floa
         faded = error / _RATE_INT_FADE_RAD_S
         grown = state[RATE_INT + axis] + max(0.0, 1.0 - faded * faded) * i_gain * error * STEP_S
         state[RATE_INT + axis] = min(_RATE_INT_LIMIT, max(-_RATE_INT_LIMIT, grown))
-    return min(1.0, max(-1.0, torque))
+    return float(min(1.0, max(-1.0, torque)))
 
 
 @njit(cache=True, error_model="numpy")
 def _drive_motors(state: Row, motor_gain: float, thrust: float, roll: float, pitch: float, yaw: float) -> None:
-    """Quad X mixer without airmode, then motor lag. Saturation lowers the collective, then roll and pitch; yaw gives way first."""
+    """Quad X mixer without airmode, then motor lag. Yaw gives way first; then the collective is lowered, then roll and pitch."""
     roll, pitch = _ROLL_PITCH_MIX * roll, _ROLL_PITCH_MIX * pitch
     spread = abs(roll) + abs(pitch)  # of the four motors: some are up and some down by exactly this
     thrust = max(min(thrust, 1.0 - spread), min(thrust, 0.5))
@@ -318,9 +279,9 @@ def _lag(state: Row, motor: int, motor_gain: float, command: float) -> None:
 @njit(cache=True, error_model="numpy")
 def _rigid_body(state: Row, params: Row, wind: Row) -> None:
     """One semi-implicit Euler step of the free body, or rest on the ground while thrust does not carry the weight."""
-    full = params[P_MOTOR_THRUST_MAX]
+    full = params[vp.MOTOR_THRUST_MAX]
     t0, t1, t2, t3 = full * state[MOTOR], full * state[MOTOR + 1], full * state[MOTOR + 2], full * state[MOTOR + 3]
-    thrust_acc = (t0 + t1 + t2 + t3) / params[P_MASS]
+    thrust_acc = (t0 + t1 + t2 + t3) / params[vp.MASS]
     if state[LANDED] > 0.0:
         if thrust_acc <= GRAVITY_M_S2:
             return
@@ -328,7 +289,7 @@ def _rigid_body(state: Row, params: Row, wind: Row) -> None:
     w, x, y, z = state[QUAT], state[QUAT + 1], state[QUAT + 2], state[QUAT + 3]
     air_x, air_y, air_z = state[VEL] - wind[0], state[VEL + 1] - wind[1], state[VEL + 2] - wind[2]
     air_speed = math.sqrt(air_x * air_x + air_y * air_y + air_z * air_z)
-    drag = (params[P_DRAG_LINEAR] + params[P_DRAG_QUADRATIC] * air_speed) / params[P_MASS]
+    drag = (params[vp.DRAG_LINEAR] + params[vp.DRAG_QUADRATIC] * air_speed) / params[vp.MASS]
     state[ACC] = 2.0 * (x * z + w * y) * thrust_acc - drag * air_x
     state[ACC + 1] = 2.0 * (y * z - w * x) * thrust_acc - drag * air_y
     state[ACC + 2] = (1.0 - 2.0 * (x * x + y * y)) * thrust_acc - drag * air_z - GRAVITY_M_S2
@@ -338,9 +299,9 @@ def _rigid_body(state: Row, params: Row, wind: Row) -> None:
     _rotate(
         state,
         params,
-        params[P_ARM_Y] * (t1 + t2 - t0 - t3),
-        params[P_ARM_X] * (t1 + t3 - t0 - t2),
-        params[P_YAW_MOMENT] * (t2 + t3 - t0 - t1),
+        params[vp.ARM_Y] * (t1 + t2 - t0 - t3),
+        params[vp.ARM_X] * (t1 + t3 - t0 - t2),
+        params[vp.YAW_MOMENT] * (t2 + t3 - t0 - t1),
     )
     if state[POS + 2] <= 0.0 and state[VEL + 2] <= 0.0:
         _touch_down(state)
@@ -349,7 +310,7 @@ def _rigid_body(state: Row, params: Row, wind: Row) -> None:
 @njit(cache=True, error_model="numpy")
 def _rotate(state: Row, params: Row, torque_x: float, torque_y: float, torque_z: float) -> None:
     """Euler's equation and the quaternion kinematics under body torques, N m."""
-    ixx, iyy, izz, damping = params[P_IXX], params[P_IYY], params[P_IZZ], params[P_DRAG_ANGULAR]
+    ixx, iyy, izz, damping = params[vp.IXX], params[vp.IYY], params[vp.IZZ], params[vp.DRAG_ANGULAR]
     p, q, r = state[OMEGA], state[OMEGA + 1], state[OMEGA + 2]
     state[ALPHA] = (torque_x - damping * p - (izz - iyy) * q * r) / ixx
     state[ALPHA + 1] = (torque_y - damping * q - (ixx - izz) * p * r) / iyy

@@ -15,21 +15,21 @@ from numpy.typing import NDArray
 GRAVITY_M_S2 = 9.80665
 
 (
-    P_MASS, P_IXX, P_IYY, P_IZZ, P_ARM_X, P_ARM_Y, P_MOTOR_THRUST_MAX, P_YAW_MOMENT, P_MOTOR_LAG,
-    P_DRAG_LINEAR, P_DRAG_QUADRATIC, P_DRAG_ANGULAR,
-    P_VEL_P_XY, P_VEL_I_XY, P_VEL_D_XY, P_VEL_P_Z, P_VEL_I_Z, P_VEL_D_Z,
-    P_VEL_MAX_XY, P_VEL_MAX_UP, P_VEL_MAX_DOWN, P_ACC_CUTOFF_HZ,
-    P_TAN_TILT_MAX, P_HOVER_THRUST, P_THRUST_MIN,
-    P_ATT_P_ROLL, P_ATT_P_PITCH, P_ATT_P_YAW, P_YAW_SETPOINT_AGE, P_RATE_MAX_XY, P_RATE_MAX_Z,
-    P_RATE_P_XY, P_RATE_I_XY, P_RATE_D_XY, P_RATE_P_Z, P_RATE_I_Z, P_RATE_D_Z, P_DGYRO_CUTOFF_HZ,
+    MASS, IXX, IYY, IZZ, ARM_X, ARM_Y, MOTOR_THRUST_MAX, YAW_MOMENT, MOTOR_LAG,
+    DRAG_LINEAR, DRAG_QUADRATIC, DRAG_ANGULAR,
+    VEL_P_XY, VEL_I_XY, VEL_D_XY, VEL_P_Z, VEL_I_Z, VEL_D_Z,
+    VEL_MAX_XY, VEL_MAX_UP, VEL_MAX_DOWN, ACC_CUTOFF_HZ,
+    TAN_TILT_MAX, HOVER_THRUST, THRUST_MIN,
+    ATT_P_ROLL, ATT_P_PITCH, ATT_P_YAW, YAW_SETPOINT_AGE, RATE_MAX_XY, RATE_MAX_Z,
+    RATE_P_XY, RATE_I_XY, RATE_D_XY, RATE_P_Z, RATE_I_Z, RATE_D_Z, DGYRO_CUTOFF_HZ,
 ) = range(38)  # fmt: skip
 PARAM_SIZE = 38
 
 # what `randomised` spreads; the rest are limits and filters of the autopilot, known exactly
 _SPREAD_FIELDS = (
     "mass_kg", "inertia_xx_kg_m2", "inertia_yy_kg_m2", "inertia_zz_kg_m2", "motor_thrust_max_n", "yaw_moment_m", "motor_lag_s",
-    "drag_linear_n_s_m", "drag_quadratic_n_s2_m2", "velocity_p_xy", "velocity_i_xy", "velocity_d_xy", "velocity_p_z", "velocity_i_z",
-    "attitude_p_roll", "attitude_p_pitch", "rate_p_xy", "rate_p_yaw",
+    "drag_linear_n_s_m", "drag_quadratic_n_s2_m2", "velocity_p_xy", "velocity_i_xy", "velocity_d_xy", "velocity_p_z",
+    "velocity_i_z", "attitude_p_roll", "attitude_p_pitch", "rate_p_xy", "rate_p_yaw",
 )  # fmt: skip
 
 
@@ -99,7 +99,7 @@ class VehicleParams:
         return self.mass_kg * GRAVITY_M_S2 / (4.0 * self.motor_thrust_max_n)
 
     def as_array(self) -> NDArray[np.float64]:
-        """The row the kernels read: float64 [PARAM_SIZE], indexed by the `P_` constants."""
+        """The row the kernels read: float64 [PARAM_SIZE], indexed by the constants of this module."""
         values = asdict(self)
         values["tilt_max_rad"] = math.tan(self.tilt_max_rad)
         values["hover_thrust_factor"] = self.hover_thrust * self.hover_thrust_factor
