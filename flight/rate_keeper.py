@@ -9,7 +9,6 @@ closer than half a period, so the recurrent policy is not stepped twice in a hur
 
 from __future__ import annotations
 
-import asyncio
 import math
 import time
 from collections.abc import Callable
@@ -85,13 +84,6 @@ class RateKeeper:
         deadline_s = self._plan()
         while (remaining_s := deadline_s - self._clock()) > 0.0:
             self._sleep(remaining_s)
-        return self._start_tick(deadline_s)
-
-    async def wait_async(self) -> float:
-        """`wait` for an asyncio loop (coarser: its timers wake up to a millisecond late)."""
-        deadline_s = self._plan()
-        if (remaining_s := deadline_s - self._clock()) > 0.0:
-            await asyncio.sleep(remaining_s)
         return self._start_tick(deadline_s)
 
     @property

@@ -1,0 +1,199 @@
+"""One 20 Hz tick: sample, observe, decide, judge. No I/O, the clock is an argument.
+
+The same function is driven by the MAVSDK loop in real time, by the simulator in lockstep and by replay: the same scans,
+states and times give the same records, bit for bit (apart from `inference_s`, which an injected timer measures).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flight.lidar.reduce import BeamReducer, fill_unknown
+from policy_export.errors import PolicyInputError, PolicyOutputError
+from policy_export.observation import ObservationBuilder
+from policy_export.runner import PolicyRunner
+from safety.filter import SafetyFilter
+from safety.frames import CorridorVector, HeadingVector, heading_to_corridor
+from safety.messages import LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
+
+MAX_SCAN_AGE_S = 0.25
+MAX_STATE_AGE_S = 0.25
+MAX_CLOCK_AHEAD_S = 0.02
+"""A sample from further in the future than this has a wrong clock and counts as missing."""
+
+
+@dataclass(frozen=True, slots=True)
+class TickRecord:
+    """Everything about one tick. Corridor frame, SI units; without a state, `position` is None and yaw and distance NaN.
+
+    `scan_time_s`, `state_time_s`: when the samples used were measured, NaN without one. `wanted`: the policy's command,
+    None where the policy was not asked or not believed. `sent`: what the safety filter lets out. `hidden_reset`: the
+    recurrent state was zeroed in this tick. `inference_s`: NaN where the policy was not stepped.
+    """
+
+    now_s: float
+    scan_time_s: float
+    state_time_s: float
+    position: CorridorVector | None
+    velocity: CorridorVector | None
+    yaw_rad: float
+    wanted: VelocityCommand | None
+    sent: SafeCommand
+    verdict: Verdict
+    distance_to_goal_m: float
+    goal_reached: bool
+    inference_s: float
+    hidden_norm: float
+    hidden_reset: bool
+
+
+class Pilot:
+    """Policy and safety filter around one goal.
+
+    `goal`: corridor frame. `timer`: seconds, only for `inference_s`. `max_scan_age_s`, `max_state_age_s`: older samples
+    are not shown to the policy (the safety filter judges ages by its own limits). Call `reset` on OFFBOARD entry.
+    """
+
+    def __init__(
+        self,
+        policy: PolicyRunner,
+        safety: SafetyFilter,
+        goal: CorridorVector,
+        goal_radius_m: float,
+        *,
+        timer: Callable[[], float] = time.perf_counter,
+        max_scan_age_s: float = MAX_SCAN_AGE_S,
+        max_state_age_s: float = MAX_STATE_AGE_S,
+    ) -> None:
+        if not (_finite(goal) and 0.0 < goal_radius_m < math.inf):
+            raise ValueError(f"goal {goal} and radius {goal_radius_m} m must be finite, and the radius positive")
+        layout = policy.metadata.observation
+        self.goal = goal
+        self.goal_radius_m = goal_radius_m
+        self._policy = policy
+        self._safety = safety
+        self._timer = timer
+        self._max_scan_age_s = max_scan_age_s
+        self._max_state_age_s = max_state_age_s
+        self._max_gap_s = policy.metadata.reset.max_gap_s
+        self._in_heading_frame = policy.metadata.action.frame == "heading"
+        self._range_max_m = layout.lidar.range_max_m
+        self._reducer = BeamReducer(layout.lidar.beams, layout.lidar.fov_rad, layout.lidar.range_max_m)
+        self._builder = ObservationBuilder(layout)
+        self._stepped_s = -math.inf
+
+    def reset(self) -> None:
+        """Forget the recurrent state and the filter's memory: OFFBOARD entry."""
+        self._safety.reset()
+        self._forget()
+
+    def set_goal(self, goal: CorridorVector) -> None:
+        """Fly to another goal; the recurrent state starts again from zero."""
+        if not _finite(goal):
+            raise ValueError(f"goal {goal} must be finite")
+        if goal != self.goal:
+            self.goal = goal
+            self._forget()
+
+    def tick(self, scan: LidarScan | None, state: VehicleState | None, now_s: float) -> TickRecord:
+        """One step of the whole stack at `now_s`. Never raises for bad samples: they end in a braking command."""
+        state = state if _usable_state(state) else None
+        observation = self._observe(scan, state, now_s)
+        wanted, inference_s, hidden_reset = self._decide(observation, state, now_s)
+        sent, verdict = self._safety.apply(wanted, state, scan, now_s)
+        distance_m = _distance_m(state.position, self.goal) if state is not None else math.nan
+        return TickRecord(
+            now_s=now_s,
+            scan_time_s=scan.time_s if scan is not None else math.nan,
+            state_time_s=state.time_s if state is not None else math.nan,
+            position=state.position if state is not None else None,
+            velocity=state.velocity if state is not None else None,
+            yaw_rad=state.yaw_rad if state is not None else math.nan,
+            wanted=wanted,
+            sent=sent,
+            verdict=verdict,
+            distance_to_goal_m=distance_m,
+            goal_reached=distance_m <= self.goal_radius_m,
+            inference_s=inference_s,
+            hidden_norm=self._policy.hidden_norm,
+            hidden_reset=hidden_reset,
+        )
+
+    def _observe(self, scan: LidarScan | None, state: VehicleState | None, now_s: float) -> NDArray[np.float32] | None:
+        """The policy's observation, or None when a sample is missing, stale or says nothing."""
+        if scan is None or state is None:
+            return None
+        if not (_fresh(scan.time_s, now_s, self._max_scan_age_s) and _fresh(state.time_s, now_s, self._max_state_age_s)):
+            return None
+        if scan.ranges_m.ndim != 1 or scan.ranges_m.size == 0:
+            return None
+        ranges = self._reducer.reduce(scan)
+        if np.isnan(ranges).all():
+            return None
+        goal, position, velocity, acceleration = self.goal, state.position, state.velocity, state.acceleration
+        try:
+            return self._builder.build(
+                fill_unknown(ranges, self._range_max_m),
+                (position.x, position.y, position.z),
+                (velocity.x, velocity.y, velocity.z),
+                (acceleration.x, acceleration.y, acceleration.z),
+                state.yaw_rad,
+                (goal.x, goal.y, goal.z),
+            )
+        except PolicyInputError:
+            return None
+
+    def _decide(
+        self, observation: NDArray[np.float32] | None, state: VehicleState | None, now_s: float
+    ) -> tuple[VelocityCommand | None, float, bool]:
+        """(wanted command, inference time in s, whether the recurrent state was zeroed)."""
+        if observation is None or state is None:
+            return None, math.nan, False
+        gap_s = now_s - self._stepped_s
+        hidden_reset = not 0.0 <= gap_s <= self._max_gap_s
+        if hidden_reset:
+            self._forget()
+        before_s = self._timer()
+        try:
+            action = self._policy.step(observation)
+        except (PolicyOutputError, PolicyInputError):
+            self._forget()
+            return None, self._timer() - before_s, True
+        inference_s = self._timer() - before_s
+        self._stepped_s = now_s
+        return self._to_command(action, state.yaw_rad), inference_s, hidden_reset
+
+    def _to_command(self, action: NDArray[np.float32], yaw_rad: float) -> VelocityCommand:
+        vx, vy, vz, yaw_rate_rad_s = (float(value) for value in action)
+        if self._in_heading_frame:
+            return VelocityCommand(heading_to_corridor(HeadingVector(vx, vy, vz), yaw_rad), yaw_rate_rad_s)
+        return VelocityCommand(CorridorVector(vx, vy, vz), yaw_rate_rad_s)
+
+    def _forget(self) -> None:
+        self._policy.reset()
+        self._stepped_s = -math.inf
+
+
+def _usable_state(state: VehicleState | None) -> bool:
+    if state is None:
+        return False
+    scalars = (state.time_s, state.roll_rad, state.pitch_rad, state.yaw_rad, state.yaw_rate_rad_s)
+    return all(map(math.isfinite, scalars)) and all(map(_finite, (state.position, state.velocity, state.acceleration)))
+
+
+def _finite(vector: CorridorVector) -> bool:
+    return math.isfinite(vector.x) and math.isfinite(vector.y) and math.isfinite(vector.z)
+
+
+def _fresh(time_s: float, now_s: float, max_age_s: float) -> bool:
+    return -MAX_CLOCK_AHEAD_S <= now_s - time_s <= max_age_s
+
+
+def _distance_m(a: CorridorVector, b: CorridorVector) -> float:
+    return math.dist((a.x, a.y, a.z), (b.x, b.y, b.z))
