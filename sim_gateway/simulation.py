@@ -1,0 +1,336 @@
+"""One vehicle in one world, in process: physics, wind, estimate errors, LiDAR, contacts. Time passes only when asked.
+
+Deterministic: equal arguments give bit-equal results, however the steps are split over calls and however often anything is
+read. Physics noise comes from one stream, drawn in step order; what a sensor shows at a time is a pure function of
+(seed, time). The gateway drives this in real time, campaigns in lockstep.
+
+Boxes are not solid: a contact is counted, once per entry, and the vehicle flies on. Whoever runs the flight decides what
+a contact means.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sim_gateway.collision import clearance_m
+from sim_gateway.estimate import (
+    ACCELERATION_SIGMA,
+    ATTITUDE_ERROR,
+    ERROR_SIZE,
+    POSITION_BIAS,
+    POSITION_ERROR,
+    PROCESSES,
+    VELOCITY_ERROR,
+    EstimateNoise,
+    error_coefficients,
+    estimate_preset,
+    initial_error,
+    step_error,
+)
+from sim_gateway.kernel_stamp import source_stamp
+from sim_gateway.lidar import Lidar, LidarConfig
+from sim_gateway.scene import Boxes, Point, World, place_movers
+from sim_gateway.vehicle import (
+    ACC,
+    LANDED,
+    OMEGA,
+    POS,
+    STEP_S,
+    VEL,
+    initial_state,
+    roll_pitch_rad,
+    rotation,
+    step_motors_off,
+    step_velocity,
+    yaw_rad,
+)
+from sim_gateway.vehicle_params import VehicleParams
+
+Array = NDArray[np.float64]
+
+MAX_STEPS_PER_CALL = 250 * 3600
+_NORMALS = PROCESSES + 3  # one step's draws: estimate errors, then gusts
+_SCAN_STREAM, _ACCELERATION_STREAM = 0, 1
+
+# running log of the kernel
+_LEAST_CLEARANCE, _TOUCHING, _CONTACTS, _FLOWN = 0, 1, 2, 3
+
+
+@dataclass(frozen=True, slots=True)
+class WindConfig:
+    """Steady wind plus gusts (first-order Gauss-Markov per axis), world frame, m/s. Raises `ValueError` on bad values."""
+
+    mean_m_s: Point = (0.0, 0.0, 0.0)
+    gust_sigma_m_s: float = 0.0
+    gust_time_s: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (*self.mean_m_s, self.gust_sigma_m_s, self.gust_time_s))):
+            raise ValueError("wind: every value must be finite")
+        if self.gust_sigma_m_s < 0.0 or self.gust_time_s <= 0.0:
+            raise ValueError("wind: gust_sigma_m_s must not be negative and gust_time_s must be above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Motion in the corridor frame, SI: the truth, or the vehicle's estimate of it.
+
+    `acceleration_m_s2`: dv/dt, gravity removed. `roll_rad` right side down, `pitch_rad` nose up, `yaw_rad` counter-clockwise,
+    in [-pi, pi]. `angular_rate_rad_s`: body axes (ahead, left, up).
+    """
+
+    time_s: float
+    position_m: Point
+    velocity_m_s: Point
+    acceleration_m_s2: Point
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    angular_rate_rad_s: Point
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """One scan. `ranges_m`: float32 [beams], right to left; +inf = nothing seen, 0 = nearer than `range_min_m`."""
+
+    time_s: float
+    ranges_m: NDArray[np.float32]
+    angle_min_rad: float
+    angle_increment_rad: float
+    range_min_m: float
+    range_max_m: float
+
+
+def _compile_advance(stamp: str) -> Any:
+    """The stepping kernel; compiled anew when a source it builds on changes (see `kernel_stamp`)."""
+
+    @njit(cache=True)
+    def advance(  # type: ignore[no-untyped-def]
+        state, params, velocity_sp, yaw_rate_sp, motors_on, normals, first_step,
+        boxes, fixed, movers, error, coefficients, wind_mean, gust, gust_coefficients, radius, log,
+    ):  # fmt: skip
+        stamp  # noqa: B018  (closing over it puts it into the cache key)
+        wind = np.empty(3)
+        for step in range(normals.shape[0]):
+            for i in range(3):
+                gust[i] = gust_coefficients[0] * gust[i] + gust_coefficients[1] * normals[step, PROCESSES + i]
+                wind[i] = wind_mean[i] + gust[i]
+            step_error(error, coefficients, normals[step])
+            x, y, z = state[POS], state[POS + 1], state[POS + 2]
+            if motors_on:
+                step_velocity(state, params, velocity_sp, yaw_rate_sp, wind, error[VELOCITY_ERROR : VELOCITY_ERROR + 3], 1)
+            else:
+                step_motors_off(state, params, wind, 1)
+            dx, dy, dz = state[POS] - x, state[POS + 1] - y, state[POS + 2] - z
+            log[_FLOWN] += math.sqrt(dx * dx + dy * dy + dz * dz)
+            place_movers(movers, movers.shape[0], (first_step + step + 1) * STEP_S, boxes[fixed:])
+            _watch_clearance(boxes, state, radius, log)
+
+    return advance
+
+
+@njit(cache=True)
+def _watch_clearance(boxes: Array, state: Array, radius: float, log: Array) -> None:
+    """Keep the least clearance, and count a contact whenever clearance falls below zero."""
+    clearance = clearance_m(boxes, state[POS : POS + 3], radius)
+    log[_LEAST_CLEARANCE] = min(log[_LEAST_CLEARANCE], clearance)
+    touching = 1.0 if clearance < 0.0 else 0.0
+    if touching > log[_TOUCHING]:
+        log[_CONTACTS] += 1.0
+    log[_TOUCHING] = touching
+
+
+_advance = _compile_advance(source_stamp("simulation", "vehicle", "vehicle_params", "estimate", "scene", "collision"))
+
+
+def step_at(time_s: float) -> int:
+    """Number of the physics step nearest to `time_s` (halves round up): tick k of 20 Hz is at `step_at(k * 0.05)`.
+
+    A tick is 12.5 steps, so drivers advance by `step_at(next tick) - simulation.steps`, 12 and 13 in turn.
+    """
+    return math.floor(time_s / STEP_S + 0.5 + 1e-9)
+
+
+class Simulation:
+    """A vehicle in `world`, from time 0, in steps of 4 ms.
+
+    Args:
+        world: where; its start and start yaw are used.
+        params: the vehicle; Iris class by default.
+        lidar: the scanner; the policy's 180 beams by default, `LidarConfig.device()` for the SCIP emulator.
+        estimate: preset name or sizes of the estimate's errors.
+        wind: steady wind and gusts.
+        seed: of everything random here (the world has its own).
+        hover_height_m: None starts on the ground with motors off; a number starts hovering there above the start.
+        contact_radius_m: radius of the sphere whose distance to boxes is the clearance.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        params: VehicleParams | None = None,
+        lidar: LidarConfig | None = None,
+        estimate: EstimateNoise | str = "nominal",
+        wind: WindConfig | None = None,
+        seed: int = 0,
+        *,
+        hover_height_m: float | None = None,
+        contact_radius_m: float = 0.35,
+    ) -> None:
+        params, wind = params or VehicleParams(), wind or WindConfig()
+        self.world, self.seed, self.steps, self.contact_radius_m = world, seed, 0, contact_radius_m
+        self._lidar = Lidar(lidar or LidarConfig())
+        self._params = params.as_array()
+        flying = hover_height_m is not None
+        place = (*world.start[:2], world.start[2] if hover_height_m is None else hover_height_m)
+        self._state = initial_state(place, world.start_yaw_rad, flying, params)
+        self._boxes = world.boxes_at(0.0)
+        self._generator = np.random.Generator(np.random.PCG64([seed, 0]))
+        self._sensor_keys = [np.random.SeedSequence([seed, 1, i]).generate_state(2, np.uint64) for i in range(2)]
+        self._start_errors(estimate_preset(estimate) if isinstance(estimate, str) else estimate)
+        self._start_wind(wind)
+        self._log = np.array([math.inf, 0.0, 0.0, 0.0])
+        _watch_clearance(self._boxes, self._state, contact_radius_m, self._log)
+
+    def _start_errors(self, noise: EstimateNoise) -> None:
+        row = noise.as_array()
+        self._error, self._coefficients = np.empty(ERROR_SIZE), np.empty((2, PROCESSES))
+        self._acceleration_sigma = row[ACCELERATION_SIGMA : ACCELERATION_SIGMA + 3]
+        error_coefficients(row, STEP_S, self._coefficients)
+        initial_error(row, self._generator.standard_normal(ERROR_SIZE), self._error)
+
+    def _start_wind(self, wind: WindConfig) -> None:
+        decay = math.exp(-STEP_S / wind.gust_time_s)
+        self._wind_mean = np.array(wind.mean_m_s, dtype=np.float64)
+        self._gust = wind.gust_sigma_m_s * self._generator.standard_normal(3)
+        self._gust_coefficients = np.array([decay, wind.gust_sigma_m_s * math.sqrt(1.0 - decay * decay)])
+
+    # time
+
+    @property
+    def time_s(self) -> float:
+        """Vehicle time since the start."""
+        return self.steps * STEP_S
+
+    def advance(self, n_steps: int, velocity_sp: Sequence[float] | Array, yaw_rate_sp: float) -> None:
+        """Fly `n_steps` of 4 ms under a velocity setpoint (world, m/s) and yaw rate (rad/s, counter-clockwise).
+
+        Raises `ValueError` if a setpoint is not finite or `n_steps` is negative or absurdly large.
+        """
+        setpoint = np.array(velocity_sp, dtype=np.float64)
+        if setpoint.shape != (3,) or not np.isfinite(setpoint).all() or not math.isfinite(yaw_rate_sp):
+            raise ValueError(f"setpoint {velocity_sp}, {yaw_rate_sp}: give three finite velocities and a finite yaw rate")
+        self._step(n_steps, setpoint, float(yaw_rate_sp), motors_on=True)
+
+    def advance_motors_off(self, n_steps: int) -> None:
+        """Let `n_steps` of 4 ms pass with the motors off: at rest on the ground, falling in the air."""
+        self._step(n_steps, np.zeros(3), 0.0, motors_on=False)
+
+    def _step(self, n_steps: int, setpoint: Array, yaw_rate_sp: float, *, motors_on: bool) -> None:
+        if not 0 <= n_steps <= MAX_STEPS_PER_CALL:
+            raise ValueError(f"n_steps is {n_steps}: it must lie in 0..{MAX_STEPS_PER_CALL}")
+        normals = self._generator.standard_normal((n_steps, _NORMALS))
+        _advance(
+            *(self._state, self._params, setpoint, yaw_rate_sp, motors_on, normals, self.steps),
+            *(self._boxes, len(self.world.static_boxes), self.world.mover_rows),
+            *(self._error, self._coefficients, self._wind_mean, self._gust, self._gust_coefficients),
+            *(self.contact_radius_m, self._log),
+        )
+        self.steps += n_steps
+
+    # motion
+
+    @property
+    def truth(self) -> Motion:
+        """What really is."""
+        return self._motion(np.zeros(ERROR_SIZE), np.zeros(3))
+
+    def estimate(self) -> Motion:
+        """What the vehicle believes: truth plus the estimate's errors. Reading twice at one time gives the same."""
+        noise = self._sensor_generator(_ACCELERATION_STREAM).standard_normal(3)
+        return self._motion(self._error, self._acceleration_sigma * noise)
+
+    def _motion(self, error: Array, acceleration_error: Array) -> Motion:
+        state = self._state
+        position = state[POS : POS + 3] + error[POSITION_ERROR : POSITION_ERROR + 3] + error[POSITION_BIAS : POSITION_BIAS + 3]
+        roll, pitch = roll_pitch_rad(state)
+        heading = math.remainder(yaw_rad(state) + error[ATTITUDE_ERROR + 2], 2.0 * math.pi)
+        return Motion(
+            time_s=self.time_s,
+            position_m=_triple(position),
+            velocity_m_s=_triple(state[VEL : VEL + 3] + error[VELOCITY_ERROR : VELOCITY_ERROR + 3]),
+            acceleration_m_s2=_triple(state[ACC : ACC + 3] + acceleration_error),
+            roll_rad=roll + float(error[ATTITUDE_ERROR]),
+            pitch_rad=pitch + float(error[ATTITUDE_ERROR + 1]),
+            yaw_rad=heading,
+            angular_rate_rad_s=_triple(state[OMEGA : OMEGA + 3]),
+        )
+
+    @property
+    def landed(self) -> bool:
+        """Whether the vehicle rests on the ground."""
+        return bool(self._state[LANDED] > 0.0)
+
+    @property
+    def wind_m_s(self) -> Point:
+        """The wind now."""
+        return _triple(self._wind_mean + self._gust)
+
+    @property
+    def state_row(self) -> Array:
+        """A copy of the vehicle's state row (see `vehicle`), for records and bit-for-bit comparison."""
+        return self._state.copy()
+
+    # surroundings
+
+    @property
+    def lidar_config(self) -> LidarConfig:
+        """The scanner's configuration."""
+        return self._lidar.config
+
+    def scan(self) -> Scan:
+        """What the scanner sees now, from the vehicle's true place and tilt. Reading twice at one time gives the same."""
+        generator = self._sensor_generator(_SCAN_STREAM)
+        ranges = self._lidar.scan(self._boxes, self._state[POS : POS + 3], rotation(self._state), generator)
+        config = self._lidar.config
+        angles = (config.angle_min_rad, config.angle_increment_rad)
+        return Scan(self.time_s, ranges.astype(np.float32), *angles, config.range_min_m, config.range_max_m)
+
+    def boxes(self) -> Boxes:
+        """All boxes where they are now, static ones first: a copy, float64 [m, 6]."""
+        return self._boxes.copy()
+
+    @property
+    def clearance_m(self) -> float:
+        """Distance now from the vehicle's sphere to the nearest box, m; negative inside one; the floor does not count."""
+        return float(clearance_m(self._boxes, self._state[POS : POS + 3], self.contact_radius_m))
+
+    @property
+    def min_clearance_m(self) -> float:
+        """The least `clearance_m` so far, at 250 Hz."""
+        return float(self._log[_LEAST_CLEARANCE])
+
+    @property
+    def contacts(self) -> int:
+        """How many times the clearance has fallen below zero (a start inside a box counts as one)."""
+        return int(self._log[_CONTACTS])
+
+    @property
+    def flown_m(self) -> float:
+        """Length of the true path so far, at 250 Hz."""
+        return float(self._log[_FLOWN])
+
+    def _sensor_generator(self, stream: int) -> np.random.Generator:
+        """Noise of one sensor at the current time: counter-based, so that it does not depend on what was read before."""
+        return np.random.Generator(np.random.Philox(key=self._sensor_keys[stream], counter=[0, 0, self.steps, 0]))
+
+
+def _triple(values: Array) -> Point:
+    return float(values[0]), float(values[1]), float(values[2])
