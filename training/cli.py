@@ -1,0 +1,182 @@
+"""The ``train-policy`` command."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from training.config import TrainingConfig
+    from training.trainer import Status, Trainer
+
+_EPILOG = """
+Examples:
+
+train-policy --config configs/training/ppo_lstm.yaml
+
+train-policy --config configs/training/ppo_lstm.yaml --out runs/night --seed 3 --decisions 5e6
+
+train-policy --resume runs/night
+"""
+
+app = typer.Typer(add_completion=False, rich_markup_mode="rich")
+
+
+class _UsageError(Exception):
+    """A mistake of the user's; one line that says what to change."""
+
+
+@app.command(epilog=_EPILOG)
+def train(
+    config: Annotated[Path | None, typer.Option(help="Training preset (YAML), see configs/training/.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Run folder; default runs/NAME-OF-PRESET.")] = None,
+    resume: Annotated[Path | None, typer.Option(help="Go on with the run in this folder, from its last.pt.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Replaces the preset's seed.")] = None,
+    decisions: Annotated[float | None, typer.Option(min=1, help="Replaces the preset's number of decisions.")] = None,
+    device: Annotated[str, typer.Option(help="Torch device of the network.")] = "cpu",
+    threads: Annotated[int, typer.Option(min=1, help="Torch threads; more than 1 rarely helps at this size.")] = 1,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object with the result on stdout.")] = False,
+) -> None:
+    """Train a navigation policy with PPO-LSTM in the vectorised corridor.
+
+    Writes last.pt, best.pt, metrics.jsonl and TensorBoard events to the run folder. Ctrl-C saves and stops; a killed run
+    loses at most the updates since its last checkpoint and goes on with --resume.
+    """
+    from strict_yaml import ConfigError
+    from training.checkpoint import CheckpointError
+    from training.ppo import TrainingDivergedError
+
+    try:
+        result = _run(config, out, resume, {"seed": seed, "decisions": decisions and int(decisions)}, device, threads)
+    except (_UsageError, ConfigError, CheckpointError) as error:
+        _fail(str(error), 2)
+    except TrainingDivergedError as error:
+        _fail(f"training diverged: {error}; the last checkpoint is good", 1)
+    if as_json:
+        print(json.dumps(result))
+
+
+def _fail(message: str, code: int) -> None:
+    print(f"train-policy: {message}", file=sys.stderr)
+    raise typer.Exit(code)
+
+
+def _run(
+    config: Path | None, out: Path | None, resume: Path | None, changes: dict[str, Any], device: str, threads: int
+) -> dict[str, Any]:
+    if (config is None) == (resume is None):
+        raise _UsageError("give either --config PRESET.yaml (a new run) or --resume RUN_FOLDER")
+    import torch
+
+    torch.set_num_threads(threads)
+    settings, folder = _settings(config, out, resume, changes)
+    _check_device(device)
+    from training.trainer import Trainer
+
+    trainer = Trainer(settings, folder, device)
+    if resume is not None:
+        trainer.resume(resume / "last.pt")
+    interrupted = _train(trainer)
+    print(f"{'stopped' if interrupted else 'done'}: {folder}/last.pt after {trainer.decisions:,} decisions", file=sys.stderr)
+    return {
+        "run": str(folder), "decisions": trainer.decisions, "seconds": round(trainer.seconds, 1), "finished": not interrupted,
+        "best_success": trainer.best if trainer.best >= 0.0 else None, "evaluation": trainer.evaluation,
+    }  # fmt: skip
+
+
+def _settings(config: Path | None, out: Path | None, resume: Path | None, changes: dict[str, Any]) -> tuple[TrainingConfig, Path]:
+    """The configuration with the command line's changes, and the run folder."""
+    from pydantic import ValidationError
+
+    from strict_yaml import load_config
+    from training.checkpoint import load_checkpoint
+    from training.config import TrainingConfig
+
+    if config is not None:
+        base, folder = load_config(config, TrainingConfig), out or Path("runs") / config.stem
+        if (folder / "last.pt").exists():
+            raise _UsageError(f"{folder} already holds a run: go on with --resume {folder}, or give another --out")
+    else:
+        assert resume is not None
+        if changes["seed"] is not None:
+            raise _UsageError("--seed belongs to a new run; a resumed one keeps its own")
+        base, folder = _stored_config(load_checkpoint(resume / "last.pt", resume=True), resume), out or resume
+    try:
+        merged = base.model_dump() | {key: value for key, value in changes.items() if value is not None}
+        return TrainingConfig.model_validate(merged), folder
+    except ValidationError as error:
+        raise _UsageError(str(error.errors()[0]["msg"])) from None
+
+
+def _stored_config(content: dict[str, Any], folder: Path) -> TrainingConfig:
+    from pydantic import ValidationError
+
+    from training.config import TrainingConfig
+
+    try:
+        return TrainingConfig.model_validate(content["resume"]["config"])
+    except (ValidationError, KeyError, TypeError):
+        raise _UsageError(f"{folder}/last.pt was written by another version of the trainer; start anew with --config") from None
+
+
+def _check_device(device: str) -> None:
+    import torch
+
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError):
+        raise _UsageError(f"--device {device} cannot be used on this machine; use cpu") from None
+
+
+def _train(trainer: Trainer) -> bool:
+    """Run to the end with a progress display; True if interrupted (the state is saved)."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), TextColumn("ETA"), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=120.0) as progress:
+        task = progress.add_task("starting", total=trainer.config.decisions, completed=trainer.decisions)
+        try:
+            for status in trainer.updates():
+                progress.update(task, completed=status.decisions, description=_describe(status))
+                _log(console, trainer, status)
+        except KeyboardInterrupt:
+            trainer.save("last.pt")
+            return True
+    return False
+
+
+def _describe(status: Status) -> str:
+    best = f", held-out {status.evaluation['success']:.1%}" if status.evaluation else ""
+    return (
+        f"{status.decisions / 1e6:.2f} M decisions, {status.decisions_per_s:,.0f}/s, hold {status.hold}, "
+        f"success {status.success:.1%}, collisions {status.contacts:.1%}{best}"
+    )
+
+
+def _log(console: Any, trainer: Trainer, status: Status) -> None:
+    """A line per evaluation, and one every 10 updates when there is no terminal to show a bar on."""
+    if status.evaluation:
+        result = status.evaluation
+        console.print(
+            f"held-out corridors after {status.decisions / 1e6:.2f} M decisions: {result['success']:.1%} "
+            f"[{result['low']:.1%}, {result['high']:.1%}] of {result['episodes']}, failures {result['failures']}",
+            soft_wrap=True, highlight=False, markup=False,
+        )  # fmt: skip
+    elif not console.is_terminal and trainer.update_count % 10 == 0:
+        left = (status.total - status.decisions) / max(status.decisions_per_s, 1.0)
+        console.print(f"{_describe(status)}, ETA {left / 60.0:.0f} min", soft_wrap=True, highlight=False, markup=False)
+
+
+def main() -> None:
+    """Entry point."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""Fly the environments with the current policy and record what the learner needs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from policy_export.network import PolicyNetwork
+from training.config import PpoConfig
+from training.environment import CorridorVectorEnv
+from training.ppo import Batch, advantages, correlated_log_prob
+
+
+@dataclass(slots=True)
+class RolloutSummary:
+    """What happened in one rollout: finished episodes by outcome, sums of reward terms, decisions."""
+
+    decisions: int = 0
+    outcomes: dict[str, int] = field(default_factory=dict)
+    episode_ticks: list[float] = field(default_factory=list)
+    reward_terms: dict[str, float] = field(default_factory=dict)
+
+
+class RolloutCollector:
+    """Keeps observations, hidden state and exploration noise of all environments from one rollout to the next."""
+
+    def __init__(self, env: CorridorVectorEnv, network: PolicyNetwork, config: PpoConfig, generator: torch.Generator) -> None:
+        self.env, self.network, self.config, self.generator = env, network, config, generator
+        count = env.num_envs
+        observations, _ = env.reset()
+        self.observation = torch.from_numpy(observations.copy())
+        self.reset = torch.ones(count, dtype=torch.bool)
+        self.h, self.c = network.initial_state(count)
+        self.noise = self._fresh_noise()
+
+    def state(self) -> dict[str, Any]:
+        """Everything needed to go on exactly here (the environment keeps its own state)."""
+        return {name: getattr(self, name).clone() for name in ("observation", "reset", "h", "c", "noise")}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of ``state``."""
+        for name in ("observation", "reset", "h", "c", "noise"):
+            setattr(self, name, state[name].clone())
+
+    def _fresh_noise(self) -> Tensor:
+        return torch.randn(self.env.num_envs, 4, generator=self.generator)
+
+    @torch.no_grad()
+    def collect(self, hold: int) -> tuple[Batch, RolloutSummary]:
+        """One rollout with every action held for ``hold`` ticks. Fields of the batch are [T, B, ...]."""
+        steps, summary = self.config.steps, RolloutSummary()
+        rho = self.config.noise_correlation_per_tick**hold
+        h0, c0 = (self.h[0].clone(), self.c[0].clone())
+        rows: list[dict[str, Tensor]] = [self._decide(hold, rho, summary) for _ in range(steps)]
+        stacked = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+        last_value = self._value(self.observation, torch.arange(self.env.num_envs), keep_reset=True)
+        decay = (self.config.gamma_per_tick**hold, self.config.gae_lambda)
+        advantage, target = advantages(
+            stacked.pop("reward"),
+            stacked["value"],
+            last_value,
+            stacked.pop("terminated"),
+            stacked.pop("truncated"),
+            stacked.pop("final_value"),
+            decay,
+        )
+        return Batch(**stacked, advantage=advantage, target=target, h0=h0, c0=c0), summary
+
+    def _decide(self, hold: int, rho: float, summary: RolloutSummary) -> dict[str, Tensor]:
+        """One decision of every environment; advances all state."""
+        network = self.network
+        features = network.features(self.observation)
+        keep = (~self.reset).float().unsqueeze(-1)
+        mean, value = self._forward(features, keep)
+        noise_before = self.noise
+        correlation = torch.full((self.env.num_envs, 1), rho)
+        self.noise = rho * noise_before + math.sqrt(1.0 - rho * rho) * self._fresh_noise()
+        raw = mean + network.log_std.exp() * self.noise
+        log_prob = correlated_log_prob(raw, mean, network.log_std, noise_before, correlation)
+        action = network.action(raw)
+        observation, reward, terminated, truncated, info = self.env.step_held(action.numpy(), hold)
+        row = {
+            "features": features, "raw": raw, "noise_before": noise_before, "rho": correlation[:, 0], "log_prob": log_prob, "mean": mean,
+            "value": value, "reset": self.reset, "reward": torch.from_numpy(reward.astype(np.float32)),
+            "terminated": torch.from_numpy(terminated.copy()), "truncated": torch.from_numpy(truncated.copy()),
+        }  # fmt: skip
+        row["final_value"] = self._final_values(row["truncated"], info)
+        self.observation = torch.from_numpy(observation.copy())
+        self.reset = row["terminated"] | row["truncated"]
+        self.noise = torch.where(self.reset.unsqueeze(-1), self._fresh_noise(), self.noise)
+        _summarise(summary, info, self.env.num_envs)
+        return row
+
+    def _forward(self, features: Tensor, keep: Tensor) -> tuple[Tensor, Tensor]:
+        network = self.network
+        if network.lstm is None:
+            return network.heads(network.encode(features), features)
+        h, c = network.cell(features, self.h[0] * keep, self.c[0] * keep)
+        self.h, self.c = h.unsqueeze(0), c.unsqueeze(0)
+        return network.heads(h, features)
+
+    def _value(self, observation: Tensor, index: Tensor, keep_reset: bool) -> Tensor:
+        """Value of ``observation`` [K, 190] seen next by the environments ``index`` [K], without advancing their state."""
+        h, c = self.h[:, index], self.c[:, index]
+        if keep_reset:
+            keep = (~self.reset[index]).float().view(1, -1, 1)
+            h, c = h * keep, c * keep
+        return self.network.step(observation, h, c)[1]
+
+    def _final_values(self, truncated: Tensor, info: dict[str, Any]) -> Tensor:
+        """Value of the observation an episode was cut at by its time limit, [B]; zero elsewhere."""
+        result = torch.zeros(self.env.num_envs)
+        index = truncated.nonzero()[:, 0]
+        if len(index):
+            final = torch.from_numpy(info["final_obs"][index.numpy()].copy())
+            result[index] = self._value(final, index, keep_reset=False)
+        return result
+
+
+def _summarise(summary: RolloutSummary, info: dict[str, Any], environments: int) -> None:
+    summary.decisions += environments
+    for outcome in info["outcomes"]:
+        summary.outcomes[outcome] = summary.outcomes.get(outcome, 0) + 1
+    summary.episode_ticks.extend(info["episode_ticks"])
+    for name, value in info["reward_terms"].items():
+        summary.reward_terms[name] = summary.reward_terms.get(name, 0.0) + value

@@ -1,0 +1,74 @@
+"""Where episodes' corridors come from: a pool that is renewed steadily while training, a fixed list while evaluating."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_gateway.corridor import CorridorConfig, generate_corridor
+from sim_gateway.scene import World
+from training.config import EVALUATION_SEED_START, TRAINING_SEED_START, EnvironmentConfig
+
+
+class WorldSource(Protocol):
+    """Gives the corridor of each new episode."""
+
+    def next_world(self, environment: int, rng: np.random.Generator) -> World:
+        """The corridor for the next episode of ``environment``."""
+        ...
+
+
+def corridor_configs(config: EnvironmentConfig) -> tuple[CorridorConfig, CorridorConfig]:
+    """Generator settings of static corridors and of corridors with moving pillars."""
+    static = CorridorConfig(pillars=config.pillars, vehicle_radius_m=config.vehicle_radius_m)
+    slowest = min(0.2, config.mover_speed_max_mps)
+    moving = static.model_copy(update={"movers": config.moving_pillars, "mover_speed_m_s": (slowest, config.mover_speed_max_mps)})
+    return static, moving
+
+
+def world_for_seed(seed: int, config: EnvironmentConfig) -> World:
+    """The corridor of ``seed``: a share ``moving_share`` of all seeds (by their low digits) has moving pillars."""
+    static, moving = corridor_configs(config)
+    return generate_corridor(seed, moving if seed % 1000 < 1000 * config.moving_share else static)
+
+
+class FixedWorlds:
+    """Environment i always gets world i (modulo their number): evaluation and tests."""
+
+    def __init__(self, worlds: Sequence[World]) -> None:
+        self._worlds = list(worlds)
+
+    def next_world(self, environment: int, rng: np.random.Generator) -> World:
+        """See WorldSource."""
+        return self._worlds[environment % len(self._worlds)]
+
+
+class WorldPool:
+    """``world_pool`` corridors drawn from the training seeds; the oldest slot is replaced after every episode begun."""
+
+    def __init__(self, config: EnvironmentConfig, rng: np.random.Generator) -> None:
+        self._config = config
+        self._oldest = 0
+        self.seeds = rng.integers(TRAINING_SEED_START, EVALUATION_SEED_START, config.world_pool)
+        self._worlds = [world_for_seed(int(seed), config) for seed in self.seeds]
+
+    def next_world(self, environment: int, rng: np.random.Generator) -> World:
+        """A random corridor of the pool; one other slot gets a new corridor."""
+        slot = self._oldest
+        self._oldest = (slot + 1) % len(self._worlds)
+        self.seeds[slot] = rng.integers(TRAINING_SEED_START, EVALUATION_SEED_START)
+        self._worlds[slot] = world_for_seed(int(self.seeds[slot]), self._config)
+        return self._worlds[int(rng.integers(len(self._worlds)))]
+
+    def state(self) -> dict[str, NDArray[np.int64] | int]:
+        """Seeds in the pool and the next slot to renew."""
+        return {"seeds": self.seeds.copy(), "oldest": self._oldest}
+
+    def restore(self, seeds: NDArray[np.int64], oldest: int) -> None:
+        """Inverse of ``state``: draws the same corridors again."""
+        self.seeds = np.asarray(seeds, dtype=np.int64).copy()
+        self._oldest = int(oldest)
+        self._worlds = [world_for_seed(int(seed), self._config) for seed in self.seeds]
