@@ -20,21 +20,17 @@ from policy_export.observation import ObservationBuilder
 from policy_export.runner import PolicyRunner
 from safety.filter import SafetyFilter
 from safety.frames import CorridorVector, HeadingVector, heading_to_corridor
+from safety.lidar import scan_problem
 from safety.messages import LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
-
-MAX_SCAN_AGE_S = 0.25
-MAX_STATE_AGE_S = 0.25
-MAX_CLOCK_AHEAD_S = 0.02
-"""A sample from further in the future than this has a wrong clock and counts as missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class TickRecord:
-    """Everything about one tick. Corridor frame, SI units; without a state, `position` is None and yaw and distance NaN.
+    """Everything about one tick. Corridor frame, SI units; without a usable state, `position` is None, yaw and distance NaN.
 
     `scan_time_s`, `state_time_s`: when the samples used were measured, NaN without one. `wanted`: the policy's command,
     None where the policy was not asked or not believed. `sent`: what the safety filter lets out. `hidden_reset`: the
-    recurrent state was zeroed in this tick. `inference_s`: NaN where the policy was not stepped.
+    recurrent state was zero before or after this tick's step. `inference_s`: NaN where the policy was not stepped.
     """
 
     now_s: float
@@ -56,8 +52,8 @@ class TickRecord:
 class Pilot:
     """Policy and safety filter around one goal.
 
-    `goal`: corridor frame. `timer`: seconds, only for `inference_s`. `max_scan_age_s`, `max_state_age_s`: older samples
-    are not shown to the policy (the safety filter judges ages by its own limits). Call `reset` on OFFBOARD entry.
+    `goal`: corridor frame. `timer`: seconds, only for `inference_s`. Samples that the filter's limits call stale are not
+    shown to the policy either. Call `reset` on OFFBOARD entry.
     """
 
     def __init__(
@@ -68,8 +64,6 @@ class Pilot:
         goal_radius_m: float,
         *,
         timer: Callable[[], float] = time.perf_counter,
-        max_scan_age_s: float = MAX_SCAN_AGE_S,
-        max_state_age_s: float = MAX_STATE_AGE_S,
     ) -> None:
         if not (_finite(goal) and 0.0 < goal_radius_m < math.inf):
             raise ValueError(f"goal {goal} and radius {goal_radius_m} m must be finite, and the radius positive")
@@ -79,19 +73,15 @@ class Pilot:
         self._policy = policy
         self._safety = safety
         self._timer = timer
-        self._max_scan_age_s = max_scan_age_s
-        self._max_state_age_s = max_state_age_s
-        self._max_gap_s = policy.metadata.reset.max_gap_s
+        self._limits = safety.config
         self._in_heading_frame = policy.metadata.action.frame == "heading"
-        self._range_max_m = layout.lidar.range_max_m
         self._reducer = BeamReducer(layout.lidar.beams, layout.lidar.fov_rad, layout.lidar.range_max_m)
         self._builder = ObservationBuilder(layout)
-        self._stepped_s = -math.inf
 
     def reset(self) -> None:
         """Forget the recurrent state and the filter's memory: OFFBOARD entry."""
         self._safety.reset()
-        self._forget()
+        self._policy.reset("offboard_entry")
 
     def set_goal(self, goal: CorridorVector) -> None:
         """Fly to another goal; the recurrent state starts again from zero."""
@@ -99,22 +89,22 @@ class Pilot:
             raise ValueError(f"goal {goal} must be finite")
         if goal != self.goal:
             self.goal = goal
-            self._forget()
+            self._policy.reset("goal_change")
 
     def tick(self, scan: LidarScan | None, state: VehicleState | None, now_s: float) -> TickRecord:
         """One step of the whole stack at `now_s`. Never raises for bad samples: they end in a braking command."""
-        state = state if _usable_state(state) else None
-        observation = self._observe(scan, state, now_s)
-        wanted, inference_s, hidden_reset = self._decide(observation, state, now_s)
+        known = state if _usable(state) else None
+        observation = self._observe(scan, known, now_s)
+        wanted, inference_s, hidden_reset = self._decide(observation, known, now_s)
         sent, verdict = self._safety.apply(wanted, state, scan, now_s)
-        distance_m = _distance_m(state.position, self.goal) if state is not None else math.nan
+        distance_m = _distance_m(known.position, self.goal) if known is not None else math.nan
         return TickRecord(
             now_s=now_s,
             scan_time_s=scan.time_s if scan is not None else math.nan,
             state_time_s=state.time_s if state is not None else math.nan,
-            position=state.position if state is not None else None,
-            velocity=state.velocity if state is not None else None,
-            yaw_rad=state.yaw_rad if state is not None else math.nan,
+            position=known.position if known is not None else None,
+            velocity=known.velocity if known is not None else None,
+            yaw_rad=known.yaw_rad if known is not None else math.nan,
             wanted=wanted,
             sent=sent,
             verdict=verdict,
@@ -127,19 +117,13 @@ class Pilot:
 
     def _observe(self, scan: LidarScan | None, state: VehicleState | None, now_s: float) -> NDArray[np.float32] | None:
         """The policy's observation, or None when a sample is missing, stale or says nothing."""
-        if scan is None or state is None:
-            return None
-        if not (_fresh(scan.time_s, now_s, self._max_scan_age_s) and _fresh(state.time_s, now_s, self._max_state_age_s)):
-            return None
-        if scan.ranges_m.ndim != 1 or scan.ranges_m.size == 0:
-            return None
-        ranges = self._reducer.reduce(scan)
-        if np.isnan(ranges).all():
+        ranges = self._sample(scan, state, now_s)
+        if ranges is None or state is None:
             return None
         goal, position, velocity, acceleration = self.goal, state.position, state.velocity, state.acceleration
         try:
             return self._builder.build(
-                fill_unknown(ranges, self._range_max_m),
+                ranges,
                 (position.x, position.y, position.z),
                 (velocity.x, velocity.y, velocity.z),
                 (acceleration.x, acceleration.y, acceleration.z),
@@ -149,25 +133,32 @@ class Pilot:
         except PolicyInputError:
             return None
 
+    def _sample(self, scan: LidarScan | None, state: VehicleState | None, now_s: float) -> NDArray[np.float32] | None:
+        """The scan in the policy's beams; None unless scan and state are fresh and at least one beam knows something."""
+        limits = self._limits
+        if scan is None or state is None or scan_problem(scan) is not None:
+            return None
+        if not -limits.future_tolerance_s <= now_s - scan.time_s <= limits.scan_stale_s:
+            return None
+        if not -limits.future_tolerance_s <= now_s - state.time_s <= limits.state_stale_s:
+            return None
+        ranges = self._reducer.reduce(scan)
+        return None if np.isnan(ranges).all() else fill_unknown(ranges, self._reducer.range_max_m)
+
     def _decide(
         self, observation: NDArray[np.float32] | None, state: VehicleState | None, now_s: float
     ) -> tuple[VelocityCommand | None, float, bool]:
-        """(wanted command, inference time in s, whether the recurrent state was zeroed)."""
+        """(wanted command, inference time in s, whether the recurrent state started from zero)."""
         if observation is None or state is None:
             return None, math.nan, False
-        gap_s = now_s - self._stepped_s
-        hidden_reset = not 0.0 <= gap_s <= self._max_gap_s
-        if hidden_reset:
-            self._forget()
         before_s = self._timer()
         try:
-            action = self._policy.step(observation)
+            action = self._policy.step(observation, now_s)
         except (PolicyOutputError, PolicyInputError):
-            self._forget()
+            self._policy.reset("bad_output")
             return None, self._timer() - before_s, True
         inference_s = self._timer() - before_s
-        self._stepped_s = now_s
-        return self._to_command(action, state.yaw_rad), inference_s, hidden_reset
+        return self._to_command(action, state.yaw_rad), inference_s, self._policy.step_count == 1
 
     def _to_command(self, action: NDArray[np.float32], yaw_rad: float) -> VelocityCommand:
         vx, vy, vz, yaw_rate_rad_s = (float(value) for value in action)
@@ -175,12 +166,8 @@ class Pilot:
             return VelocityCommand(heading_to_corridor(HeadingVector(vx, vy, vz), yaw_rad), yaw_rate_rad_s)
         return VelocityCommand(CorridorVector(vx, vy, vz), yaw_rate_rad_s)
 
-    def _forget(self) -> None:
-        self._policy.reset()
-        self._stepped_s = -math.inf
 
-
-def _usable_state(state: VehicleState | None) -> bool:
+def _usable(state: VehicleState | None) -> bool:
     if state is None:
         return False
     scalars = (state.time_s, state.roll_rad, state.pitch_rad, state.yaw_rad, state.yaw_rate_rad_s)
@@ -189,10 +176,6 @@ def _usable_state(state: VehicleState | None) -> bool:
 
 def _finite(vector: CorridorVector) -> bool:
     return math.isfinite(vector.x) and math.isfinite(vector.y) and math.isfinite(vector.z)
-
-
-def _fresh(time_s: float, now_s: float, max_age_s: float) -> bool:
-    return -MAX_CLOCK_AHEAD_S <= now_s - time_s <= max_age_s
 
 
 def _distance_m(a: CorridorVector, b: CorridorVector) -> float:

@@ -19,12 +19,15 @@ MAX_DRIFT = 2e-4
 MAX_STEP_BACK_MS = 1000
 """A scan under way began before the clock was last read; more than this is a restart."""
 
-_BUCKET_S = 0.5
+MAX_UNEXPLAINED_S = 0.02
+"""Scans later than drift explains, all of them through the whole window, by more than this: measure the offset again."""
+
+_BUCKET_S = 0.2
 _BUCKETS = 10
 
 
 class DeviceClockError(ValueError):
-    """The device's clock ran backwards: it restarted, and its offset must be measured again."""
+    """The device's clock ran backwards or stood still for a while: its offset must be measured again."""
 
 
 class DeviceClock:
@@ -62,7 +65,7 @@ class DeviceClock:
     def measured_at(self, device_ms: int, received_s: float) -> float:
         """Monotonic time, s, of a device time that arrived at `received_s`; never later than `received_s`.
 
-        Raises `DeviceClockError` when the device's clock ran backwards.
+        Raises `DeviceClockError` when the device's clock ran backwards, or fell behind more than a crystal can.
         """
         device_s = self._unwrap(device_ms)
         self._note(received_s - device_s, received_s)
@@ -95,4 +98,7 @@ class DeviceClock:
         if self._baseline_s is None or not math.isfinite(self._offset_s):
             return min(self._offset_s, smallest)
         allowed = MAX_DRIFT * max(0.0, now_s - self._synchronised_s)
+        unexplained_s = smallest - self._baseline_s - allowed
+        if unexplained_s > MAX_UNEXPLAINED_S:
+            raise DeviceClockError(f"scans come {1e3 * unexplained_s:.0f} ms later than the device's clock explains")
         return min(self._offset_s + min(smallest - self._baseline_s, allowed), smallest)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from flight.lidar.config import LidarSource
 from safety.messages import LidarScan
 
-_EDGE = 1e-9
+_EDGE = 1e-4  # rad: beams that only touch a sector do not belong to it
 
 
 class Mounting:
