@@ -1,0 +1,367 @@
+"""The autopilot's mode logic: arming, flight modes, OFFBOARD's stream rule, failsafe, takeoff and landing, as PX4 v1.17 does it.
+
+Pure logic in vehicle time: no clock, no threads, no sockets. `Autopilot.step` takes the estimated state and returns what the
+velocity loop shall fly; commands come in through methods that return a MAV_RESULT. What the recordings show is the rule here
+(px4_reference: commands.json, modes.json, offboard_loss.json, lifecycle.json); docs/gateway.md lists what differs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from sim_gateway.flight_modes import AUTO_MAIN_MODE, FlightMode, LandedState, Result, SystemStatus
+from sim_gateway.flight_tasks import FlightTask, HoldTask, LandTask, MotionCommand, OffboardTask, ReturnTask, TakeoffTask
+from sim_gateway.local_frame import DEFAULT_ALTITUDE_M, NedState, Vector
+from sim_gateway.parameters import ParameterStore
+from sim_gateway.setpoints import OffboardSetpoint
+
+CONTROL_PERIOD_S = 0.02  # PX4's flight tasks run at 50 Hz
+FORCE_MAGIC = 21196  # param 2 of MAV_CMD_COMPONENT_ARM_DISARM: skip the checks
+READY_AFTER_S = 4.3  # recorded: arming is denied until about here
+# MAV_SEVERITY
+CRITICAL, ERROR, INFO = 2, 3, 6
+
+_ARMING_DENIED = "Arming denied: Resolve system health failures first"
+_LANDING_DETECT_S = 1.8  # recorded 1.7 to 2.3 s from touch down to "Landing detected"
+_CLIMB_WANTED_M_S = 0.05
+_RAMP_START_M_S = 0.9  # the takeoff ramp starts as if descending, so that thrust comes up from its minimum
+_KEPT_TEXTS = 200
+_OBL_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.LOITER}  # COM_OBL_RC_ACT; all others fall back to RTL without a pilot
+_OBL_STOP_MOTORS = (6, 7)
+
+
+@dataclass(frozen=True, slots=True)
+class StatusText:
+    """One STATUSTEXT: `severity` is MAV_SEVERITY."""
+
+    time_s: float
+    severity: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class ModeChange:
+    """The mode from `time_s` on, and whether the vehicle is armed and in failsafe."""
+
+    time_s: float
+    mode: FlightMode
+    intended: FlightMode
+    armed: bool
+    failsafe: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ControlOutput:
+    """What the vehicle's velocity loop shall fly: NED m/s, clockwise rad/s. With motors off the rest is zero."""
+
+    motors_on: bool
+    velocity: Vector = (0.0, 0.0, 0.0)
+    yaw_rate_rad_s: float = 0.0
+
+
+MOTORS_OFF = ControlOutput(False)
+
+
+class Autopilot:
+    """One vehicle's commander. Call `step` every `CONTROL_PERIOD_S` of vehicle time; requests may come at any time between."""
+
+    def __init__(
+        self,
+        parameters: ParameterStore | None = None,
+        *,
+        ready_after_s: float = READY_AFTER_S,
+        altitude_amsl_m: float = DEFAULT_ALTITUDE_M,
+    ) -> None:
+        self.parameters = parameters or ParameterStore()
+        self.mode = FlightMode.LOITER
+        self.intended = FlightMode.LOITER
+        self.armed = False
+        self.failsafe = False
+        self.landed = True
+        self.home: Vector = (0.0, 0.0, 0.0)
+        self.state = NedState(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, True)
+        self.target = OffboardSetpoint()
+        self.output = MOTORS_OFF
+        self.texts: deque[StatusText] = deque(maxlen=_KEPT_TEXTS)
+        self.mode_changes: deque[ModeChange] = deque(maxlen=_KEPT_TEXTS)
+        self._ready_after_s = ready_after_s
+        self._altitude_amsl_m = altitude_amsl_m
+        self._setpoint = OffboardSetpoint(velocity=(0.0, 0.0, 0.0))
+        self._setpoint_time_s = -math.inf
+        self._after_disarming = FlightMode.LOITER
+        self._task: FlightTask | None = None
+        self._task_target: Vector | None = None
+        self._task_yaw_rad: float | None = None
+        self._takeoff_altitude_m = math.nan
+        self._armed_at_s = 0.0
+        self._flown = False
+        self._ramp_start_s: float | None = None
+        self._ground_since_s: float | None = None
+        self._landed_at_s = 0.0
+        self._last_step_s: float | None = None
+
+    # ---- what telemetry reports
+
+    @property
+    def now_s(self) -> float:
+        """Vehicle time of the last step."""
+        return self.state.time_s
+
+    @property
+    def healthy(self) -> bool:
+        """Whether start-up has finished, so that arming is possible in a mode that allows it."""
+        return self.now_s >= self._ready_after_s
+
+    @property
+    def can_arm(self) -> bool:
+        """The pre-arm verdict for the mode now selected."""
+        stream = self.mode is not FlightMode.OFFBOARD or self.stream_alive
+        return self.healthy and stream and self.mode not in (FlightMode.LAND, FlightMode.RTL)
+
+    @property
+    def stream_alive(self) -> bool:
+        """Whether a valid setpoint came within COM_OF_LOSS_T."""
+        return self.now_s - self._setpoint_time_s < self.parameters.get("COM_OF_LOSS_T")
+
+    @property
+    def system_status(self) -> SystemStatus:
+        """HEARTBEAT.system_status."""
+        if self.armed:
+            return SystemStatus.CRITICAL if self.failsafe else SystemStatus.ACTIVE
+        return SystemStatus.STANDBY if self.can_arm else SystemStatus.UNINIT
+
+    @property
+    def landed_state(self) -> LandedState:
+        """EXTENDED_SYS_STATE.landed_state."""
+        if self.landed:
+            return LandedState.ON_GROUND
+        if self._task is not None and self._task.landing:
+            return LandedState.LANDING
+        return LandedState.TAKEOFF if self.mode is FlightMode.TAKEOFF else LandedState.IN_AIR
+
+    # ---- requests
+
+    def set_setpoint(self, setpoint: OffboardSetpoint) -> None:
+        """A valid offboard setpoint arrived now."""
+        self._setpoint = setpoint
+        self._setpoint_time_s = self.now_s
+
+    def arm(self, force: bool = False) -> Result:
+        """Arm; `force` skips the checks."""
+        if self.armed:
+            return Result.ACCEPTED
+        if not force and not self.can_arm:
+            self.say(CRITICAL, _ARMING_DENIED)
+            return Result.TEMPORARILY_REJECTED
+        self.armed, self._flown, self._armed_at_s = True, False, self.now_s
+        self.home = self.state.position
+        self._task = None
+        self.say(INFO, "Armed by external command")
+        self._record()
+        return Result.ACCEPTED
+
+    def disarm(self, force: bool = False) -> Result:
+        """Disarm; refused in the air unless forced."""
+        if not self.armed:
+            return Result.ACCEPTED
+        if not self.landed and not force:
+            self.say(CRITICAL, "Disarming denied: not landed")
+            return Result.TEMPORARILY_REJECTED
+        self._disarm("external command")
+        return Result.ACCEPTED
+
+    def set_mode_numbers(self, main: int, sub: int, from_pilot: bool = False) -> Result:
+        """MAV_CMD_DO_SET_MODE with PX4's numbers. An unknown main mode is accepted and does nothing, as recorded."""
+        mode = FlightMode.from_numbers(main, sub)
+        if mode is not None:
+            return self.set_mode(mode, from_pilot)
+        if main != AUTO_MAIN_MODE:
+            return Result.ACCEPTED
+        self.say(CRITICAL, "Unsupported auto mode")
+        return Result.TEMPORARILY_REJECTED
+
+    def set_mode(self, mode: FlightMode, from_pilot: bool = False) -> Result:
+        """Change the intended mode; any mode is taken while disarmed. A ground station is also told why not."""
+        if self.armed and not self._can_fly(mode):
+            if from_pilot:
+                self.say(CRITICAL, f"Switching to {mode.label} is currently not available")
+            return Result.TEMPORARILY_REJECTED
+        self._task_target = self._task_yaw_rad = None
+        self._takeoff_altitude_m = math.nan
+        self._intend(mode)
+        return Result.ACCEPTED
+
+    def takeoff(self, altitude_amsl_m: float = math.nan) -> Result:
+        """MAV_CMD_NAV_TAKEOFF: to an altitude above sea level, or MIS_TAKEOFF_ALT above home."""
+        self._takeoff_altitude_m = altitude_amsl_m
+        self._intend(FlightMode.TAKEOFF)
+        return Result.ACCEPTED
+
+    def land(self) -> Result:
+        """MAV_CMD_NAV_LAND: here."""
+        self.say(INFO, "Landing at current position")
+        return self.set_mode(FlightMode.LAND)
+
+    def return_to_launch(self) -> Result:
+        """MAV_CMD_NAV_RETURN_TO_LAUNCH."""
+        self.say(INFO, "Returning to launch")
+        return self.set_mode(FlightMode.RTL)
+
+    def reposition(self, target: Vector, yaw_rad: float | None = None) -> Result:
+        """MAV_CMD_DO_REPOSITION: hold at a local NED point; components that are not finite mean here."""
+        self.set_mode(FlightMode.LOITER)
+        if any(math.isfinite(value) for value in target):
+            here = self.state.position
+            x, y, z = (value if math.isfinite(value) else here[i] for i, value in enumerate(target))
+            self._task_target = (x, y, z)
+        self._task_yaw_rad = yaw_rad
+        return Result.ACCEPTED
+
+    def say(self, severity: int, text: str) -> None:
+        """Queue a STATUSTEXT."""
+        self.texts.append(StatusText(self.now_s, severity, text))
+
+    # ---- the step
+
+    def step(self, state: NedState) -> ControlOutput:
+        """Advance to `state.time_s` and return the setpoint to fly until the next step."""
+        dt_s = CONTROL_PERIOD_S if self._last_step_s is None else max(state.time_s - self._last_step_s, 0.0)
+        self._last_step_s = state.time_s
+        self.state = state
+        if not self.armed:
+            self.landed = self.landed or state.on_ground
+            return self.output
+        self._check_offboard_loss()
+        if not self.armed:
+            return self.output
+        if self._task is None:
+            self._task = self._start_task()
+        command = self._run(self._task, dt_s)
+        self.output = self._through_takeoff_ramp(command)
+        self._detect_landing()
+        return self.output
+
+    def _run(self, task: FlightTask, dt_s: float) -> MotionCommand:
+        if isinstance(task, OffboardTask):
+            task.setpoint = self._setpoint
+        was_landing = task.landing
+        command = task.update(self.state, dt_s)
+        self.target = command.target
+        if task.landing and not was_landing:
+            self.say(INFO, "RTL: land at destination")
+        if isinstance(task, TakeoffTask) and task.finished:
+            self._task_target, self._task_yaw_rad = task.target, task.state_at_entry.yaw_rad
+            self._intend(FlightMode.LOITER)
+        return command
+
+    def _can_fly(self, mode: FlightMode) -> bool:
+        if mode is FlightMode.OFFBOARD:
+            return self.stream_alive
+        return not mode.needs_pilot and mode is not FlightMode.MISSION
+
+    def _intend(self, mode: FlightMode) -> None:
+        self.intended = mode
+        if mode not in (FlightMode.LAND, FlightMode.RTL):
+            self._after_disarming = mode
+        self.failsafe = False
+        self._enter(mode)
+
+    def _enter(self, mode: FlightMode) -> None:
+        self.mode = mode
+        self._task = None
+        self._record()
+
+    def _record(self) -> None:
+        self.mode_changes.append(ModeChange(self.now_s, self.mode, self.intended, self.armed, self.failsafe))
+
+    def _start_task(self) -> FlightTask:
+        parameters, state = self.parameters, self.state
+        if self.mode is FlightMode.OFFBOARD:
+            return OffboardTask(parameters, self._setpoint)
+        if self.mode is FlightMode.TAKEOFF:
+            return TakeoffTask(parameters, state, self._takeoff_target_down_m())
+        if self.mode is FlightMode.LAND:
+            return LandTask(parameters, state, self.home[2])
+        if self.mode is FlightMode.RTL:
+            return self._start_return()
+        return HoldTask(parameters, state, self._task_target, self._task_yaw_rad)
+
+    def _takeoff_target_down_m(self) -> float:
+        """Down coordinate of the takeoff altitude; never below where the vehicle is."""
+        if math.isfinite(self._takeoff_altitude_m):
+            down = self._altitude_amsl_m - self._takeoff_altitude_m
+        else:
+            height = self.parameters.get("MIS_TAKEOFF_ALT")
+            self.say(INFO, f"Using default takeoff altitude: {height:.1f} m")
+            down = self.home[2] - height
+        return min(down, self.state.position[2])
+
+    def _start_return(self) -> ReturnTask:
+        task = ReturnTask(self.parameters, self.state, self.home)
+        above_sea_m = self._altitude_amsl_m - self.home[2] + task.return_height_m
+        self.say(INFO, f"RTL: start return at {int(above_sea_m)} m ({int(task.return_height_m)} m above destination)")
+        return task
+
+    def _check_offboard_loss(self) -> None:
+        """The failsafe of OFFBOARD: acts when the stream is lost, gives the vehicle back when it resumes."""
+        if self.intended is not FlightMode.OFFBOARD:
+            return
+        if self.failsafe and self.stream_alive:
+            self.failsafe = False
+            self._enter(FlightMode.OFFBOARD)
+        elif not self.failsafe and not self.stream_alive:
+            self.failsafe = True
+            self.say(CRITICAL, "Failsafe activated")
+            action = int(self.parameters.get("COM_OBL_RC_ACT"))
+            self._task_target = self._task_yaw_rad = None
+            self._enter(_OBL_ACTIONS.get(action, FlightMode.RTL))
+            if action in _OBL_STOP_MOTORS:
+                self._disarm("failsafe")
+
+    def _through_takeoff_ramp(self, command: MotionCommand) -> ControlOutput:
+        """Hold a climb back while motors spool up (COM_SPOOLUP_TIME), then let its speed grow over MPC_TKO_RAMP_T."""
+        get, now_s = self.parameters.get, self.now_s
+        north, east, down = command.velocity
+        wants_climb = down < -_CLIMB_WANTED_M_S
+        if self.landed and not (wants_climb and now_s - self._armed_at_s >= get("COM_SPOOLUP_TIME")):
+            return ControlOutput(True)
+        if self.landed:
+            self.landed, self._flown, self._ramp_start_s = False, True, now_s
+            self.say(INFO, "Takeoff detected")
+        if self._ramp_start_s is not None:
+            share = (now_s - self._ramp_start_s) / max(get("MPC_TKO_RAMP_T"), 0.02)
+            climb_limit = -_RAMP_START_M_S + share * (_RAMP_START_M_S + get("MPC_TKO_SPEED"))
+            down = max(down, -climb_limit)
+            if share >= 1.0:
+                self._ramp_start_s = None
+        return ControlOutput(True, (north, east, down), command.yaw_rate_rad_s)
+
+    def _detect_landing(self) -> None:
+        """Landed after a while on the ground without wanting up; then the disarm timers run."""
+        now_s, get = self.now_s, self.parameters.get
+        if self.landed:
+            delay_s = get("COM_DISARM_LAND") if self._flown else get("COM_DISARM_PRFLT")
+            if delay_s > 0.0 and now_s - (self._landed_at_s if self._flown else self._armed_at_s) >= delay_s:
+                self._disarm("landing" if self._flown else "auto preflight disarming")
+            return
+        resting = self.state.on_ground and self.output.velocity[2] > -_CLIMB_WANTED_M_S and self._ramp_start_s is None
+        if not resting:
+            self._ground_since_s = None
+        elif self._ground_since_s is None:
+            self._ground_since_s = now_s
+        elif now_s - self._ground_since_s >= _LANDING_DETECT_S:
+            self.landed, self._landed_at_s, self._ground_since_s = True, now_s, None
+            self.say(INFO, "Landing detected")
+
+    def _disarm(self, reason: str) -> None:
+        """Motors off; the mode falls back to the last one intended that may be armed in."""
+        self.armed = self.failsafe = False
+        self.landed = self.landed or self.state.on_ground
+        self._ramp_start_s = self._ground_since_s = None
+        self._task_target = self._task_yaw_rad = None
+        self.intended = self._after_disarming
+        self.output, self.target = MOTORS_OFF, OffboardSetpoint()
+        self.say(INFO, f"Disarmed by {reason}")
+        self._enter(self.intended)

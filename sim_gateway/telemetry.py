@@ -1,0 +1,317 @@
+"""Telemetry: how each MAVLink message is filled from the vehicle, and how often PX4 sends it on which link.
+
+Rates are those of link_census.json (PX4 v1.17 SITL defaults). A message begins at the vehicle time at which PX4's first one was
+recorded after start-up (lifecycle.json).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import development as mav
+
+from sim_gateway.autopilot import Autopilot
+from sim_gateway.local_frame import LocalFrame, Vector
+from sim_gateway.setpoints import OffboardSetpoint
+
+Message = mav.MAVLink_message
+Quaternion = tuple[float, float, float, float]
+SYSTEM_ID, COMPONENT_ID = 1, 1
+
+GPS_FROM_S, LOCAL_FROM_S, HEARTBEAT_FROM_S, HOME_FROM_S, GLOBAL_FROM_S, POSITION_FLAG_FROM_S = 0.75, 0.78, 1.75, 2.76, 3.2, 3.77
+
+# message: (Hz on the onboard link, Hz on the ground station link); 0: only when asked for
+STREAM_RATES_HZ: dict[str, tuple[float, float]] = {
+    "ALTITUDE": (10, 1),
+    "ATTITUDE": (100, 50),
+    "ATTITUDE_QUATERNION": (50, 50),
+    "ATTITUDE_TARGET": (10, 50),
+    "BATTERY_STATUS": (0.5, 0.5),
+    "CURRENT_MODE": (0.5, 0.5),
+    "DISTANCE_SENSOR": (10, 0.5),
+    "ESTIMATOR_STATUS": (1, 0.5),
+    "EXTENDED_SYS_STATE": (5, 1),
+    "GLOBAL_POSITION_INT": (50, 50),
+    "GPS_GLOBAL_ORIGIN": (0, 0),
+    "GPS_RAW_INT": (8, 5),
+    "HEARTBEAT": (1, 1),
+    "HIGHRES_IMU": (50, 0),
+    "HOME_POSITION": (0.5, 0.5),
+    "LOCAL_POSITION_NED": (30, 50),
+    "MISSION_CURRENT": (1, 1),
+    "ODOMETRY": (30, 0),
+    "PING": (1, 0.1),
+    "POSITION_TARGET_LOCAL_NED": (10, 50),
+    "SCALED_PRESSURE": (1, 1),
+    "SERVO_OUTPUT_RAW": (10, 50),
+    "SYSTEM_TIME": (1, 0),
+    "SYS_STATUS": (5, 1),
+    "TIMESYNC": (10, 0),
+    "VFR_HUD": (10, 4),
+    "VIBRATION": (0.5, 0.1),
+}
+ONBOARD, GROUND = 0, 1  # column of STREAM_RATES_HZ
+_FROM_S = {
+    "GPS_RAW_INT": GPS_FROM_S,
+    "LOCAL_POSITION_NED": LOCAL_FROM_S,
+    "ODOMETRY": LOCAL_FROM_S,
+    "HEARTBEAT": HEARTBEAT_FROM_S,
+    "HOME_POSITION": HOME_FROM_S,
+    "GLOBAL_POSITION_INT": GLOBAL_FROM_S,
+}
+
+_SENSORS = 0x1 | 0x2 | 0x4 | 0x8  # gyro, accelerometer, magnetometer, barometer
+_CONTROLS = 0x400 | 0x800 | 0x1000 | 0x2000 | 0x4000 | 0x8000
+_GPS, _AHRS, _BATTERY, _PREARM = 0x20, 0x200000, 0x2000000, 0x10000000
+_MAGNETIC_FIELD_NED_GAUSS: Vector = (0.212, 0.009, 0.427)  # at PX4's default place
+_EPOCH_US = int(time.time() * 1e6)
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The vehicle at one instant as its own autopilot believes it: NED and FRD, SI, radians. Motors 0..1."""
+
+    time_s: float
+    position: Vector
+    velocity: Vector
+    attitude: Quaternion  # body FRD to NED, w x y z
+    roll_pitch_yaw: Vector
+    body_rates: Vector
+    specific_force: Vector  # body, gravity included as an accelerometer sees it
+    motors: tuple[float, float, float, float]
+
+
+def rotate_to_body(attitude: Quaternion, vector: Vector) -> Vector:
+    """A NED vector in body axes."""
+    w, x, y, z = attitude
+    a, b, c = vector
+    return (
+        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c,
+        2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c,
+        2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c,
+    )
+
+
+def _heading_deg(yaw_rad: float) -> float:
+    return math.degrees(yaw_rad) % 360.0
+
+
+def _clamp_int(value: float, low: int, high: int) -> int:
+    return int(min(max(value, low), high))
+
+
+class Telemetry:
+    """Builds messages for the vehicle's present state. `snapshot` is called once per message."""
+
+    def __init__(self, autopilot: Autopilot, frame: LocalFrame, snapshot: Callable[[], Snapshot]) -> None:
+        self._autopilot = autopilot
+        self._frame = frame
+        self._snapshot = snapshot
+        self._sequence = 0
+        self._builders: dict[str, Callable[[Snapshot], Message]] = {
+            name: getattr(self, f"_{name.lower()}") for name in (*STREAM_RATES_HZ, "AUTOPILOT_VERSION", "PROTOCOL_VERSION")
+        }
+        self._names = {getattr(mav, f"MAVLINK_MSG_ID_{name}"): name for name in self._builders}
+
+    def name_of(self, message_id: int) -> str | None:
+        """The message's name if this vehicle can send it."""
+        return self._names.get(message_id)
+
+    def available(self, name: str) -> bool:
+        """Whether start-up has come far enough for this message."""
+        return self._autopilot.now_s >= _FROM_S.get(name, LOCAL_FROM_S)
+
+    def build(self, name: str) -> Message:
+        """The message now; raises KeyError for a name outside the tables."""
+        return self._builders[name](self._snapshot())
+
+    # ---- identity and status
+
+    def _heartbeat(self, _: Snapshot) -> Message:
+        pilot = self._autopilot
+        return mav.MAVLink_heartbeat_message(
+            mav.MAV_TYPE_QUADROTOR,
+            mav.MAV_AUTOPILOT_PX4,
+            pilot.mode.base_mode(pilot.armed),
+            pilot.mode.custom_mode,
+            int(pilot.system_status),
+            3,
+        )
+
+    def _current_mode(self, _: Snapshot) -> Message:
+        pilot = self._autopilot
+        return mav.MAVLink_current_mode_message(pilot.mode.standard_mode, pilot.mode.custom_mode, pilot.intended.custom_mode)
+
+    def _extended_sys_state(self, _: Snapshot) -> Message:
+        return mav.MAVLink_extended_sys_state_message(mav.MAV_VTOL_STATE_UNDEFINED, int(self._autopilot.landed_state))
+
+    def _sys_status(self, now: Snapshot) -> Message:
+        present = _SENSORS | _CONTROLS | _GPS | _AHRS | _BATTERY | _PREARM
+        health = _SENSORS | _CONTROLS | _BATTERY
+        health |= _GPS | _AHRS if now.time_s >= POSITION_FLAG_FROM_S else 0
+        health |= _PREARM if self._autopilot.can_arm or self._autopilot.armed else 0
+        return mav.MAVLink_sys_status_message(present, present, health, 300, 16200, 0, 100, 0, 0, 0, 0, 0, 0)
+
+    def _battery_status(self, _: Snapshot) -> Message:
+        cells = [4050] * 4 + [65535] * 6
+        return mav.MAVLink_battery_status_message(0, 0, 0, 32767, cells, 0, 0, -1, 100, 0, mav.MAV_BATTERY_CHARGE_STATE_OK)
+
+    def _estimator_status(self, now: Snapshot) -> Message:
+        flags = 0x33F if now.time_s >= POSITION_FLAG_FROM_S else 0x27
+        return mav.MAVLink_estimator_status_message(self._usec(now), flags, 0.1, 0.1, 0.1, 0.1, 0.0, 0.0, 0.3, 0.4)
+
+    def _autopilot_version(self, _: Snapshot) -> Message:
+        zeros = [0] * 8
+        return mav.MAVLink_autopilot_version_message(59647, 17891328, 17891328, 0, 1, zeros, zeros, zeros, 0, 0, SYSTEM_ID)
+
+    def _protocol_version(self, _: Snapshot) -> Message:
+        return mav.MAVLink_protocol_version_message(200, 100, 200, [0] * 8, [0] * 8)
+
+    def _mission_current(self, _: Snapshot) -> Message:
+        return mav.MAVLink_mission_current_message(0, 0, mav.MISSION_STATE_NO_MISSION, 0)
+
+    # ---- time
+
+    @staticmethod
+    def _usec(now: Snapshot) -> int:
+        return int(round(now.time_s * 1e6))
+
+    @staticmethod
+    def _msec(now: Snapshot) -> int:
+        return int(round(now.time_s * 1e3)) & 0xFFFFFFFF
+
+    def _system_time(self, now: Snapshot) -> Message:
+        return mav.MAVLink_system_time_message(_EPOCH_US + self._usec(now), self._msec(now))
+
+    def _timesync(self, now: Snapshot) -> Message:
+        return mav.MAVLink_timesync_message(0, self._usec(now) * 1000)
+
+    def _ping(self, now: Snapshot) -> Message:
+        self._sequence = (self._sequence + 1) & 0xFFFFFFFF
+        return mav.MAVLink_ping_message(self._usec(now), self._sequence, 0, 0)
+
+    # ---- motion
+
+    def _attitude(self, now: Snapshot) -> Message:
+        return mav.MAVLink_attitude_message(self._msec(now), *now.roll_pitch_yaw, *now.body_rates)
+
+    def _attitude_quaternion(self, now: Snapshot) -> Message:
+        return mav.MAVLink_attitude_quaternion_message(self._msec(now), *now.attitude, *now.body_rates)
+
+    def _attitude_target(self, now: Snapshot) -> Message:
+        thrust = sum(now.motors) / 4.0
+        return mav.MAVLink_attitude_target_message(self._msec(now), 0, list(now.attitude), *now.body_rates, thrust)
+
+    def _local_position_ned(self, now: Snapshot) -> Message:
+        return mav.MAVLink_local_position_ned_message(self._msec(now), *now.position, *now.velocity)
+
+    def _odometry(self, now: Snapshot) -> Message:
+        unknown = [math.nan] * 21
+        return mav.MAVLink_odometry_message(
+            self._usec(now),
+            mav.MAV_FRAME_LOCAL_NED,
+            mav.MAV_FRAME_BODY_FRD,
+            *now.position,
+            list(now.attitude),
+            *rotate_to_body(now.attitude, now.velocity),
+            *now.body_rates,
+            unknown,
+            unknown,
+            0,
+            mav.MAV_ESTIMATOR_TYPE_AUTOPILOT,
+            100,
+        )
+
+    def _global_position_int(self, now: Snapshot) -> Message:
+        latitude, longitude, altitude = self._frame.to_global(now.position)
+        home_down = self._autopilot.home[2]
+        speeds = [_clamp_int(v * 100, -32767, 32767) for v in now.velocity]
+        return mav.MAVLink_global_position_int_message(
+            self._msec(now),
+            round(latitude * 1e7),
+            round(longitude * 1e7),
+            round(altitude * 1e3),
+            round((home_down - now.position[2]) * 1e3),
+            *speeds,
+            round(_heading_deg(now.roll_pitch_yaw[2]) * 100) % 36000,
+        )
+
+    def _position_target_local_ned(self, now: Snapshot) -> Message:
+        target: OffboardSetpoint = self._autopilot.target
+        type_mask = 0 if math.isfinite(target.position[2]) else 7
+        return mav.MAVLink_position_target_local_ned_message(
+            self._msec(now),
+            mav.MAV_FRAME_LOCAL_NED,
+            type_mask,
+            *target.position,
+            *target.velocity,
+            *target.acceleration,
+            target.yaw_rad,
+            target.yaw_rate_rad_s,
+        )
+
+    def _altitude(self, now: Snapshot) -> Message:
+        up = -now.position[2]
+        above_home = self._autopilot.home[2] - now.position[2]
+        return mav.MAVLink_altitude_message(
+            self._usec(now), self._frame.altitude_m + up, self._frame.altitude_m + up, up, above_home, math.nan, max(up, 0.0)
+        )
+
+    def _vfr_hud(self, now: Snapshot) -> Message:
+        north, east, down = now.velocity
+        speed = math.hypot(north, east)
+        throttle = _clamp_int(100 * sum(now.motors) / 4.0, 0, 100)
+        heading = int(_heading_deg(now.roll_pitch_yaw[2]))
+        return mav.MAVLink_vfr_hud_message(speed, speed, heading, throttle, self._frame.altitude_m - now.position[2], -down)
+
+    def _distance_sensor(self, now: Snapshot) -> Message:
+        centimetres = _clamp_int(-100.0 * now.position[2], 0, 10000)
+        return mav.MAVLink_distance_sensor_message(self._msec(now), 0, 10000, centimetres, 0, 0, 25, 0)
+
+    # ---- sensors
+
+    def _gps_raw_int(self, now: Snapshot) -> Message:
+        latitude, longitude, altitude = self._frame.to_global(now.position)
+        speed = math.hypot(now.velocity[0], now.velocity[1])
+        course = round(_heading_deg(math.atan2(now.velocity[1], now.velocity[0])) * 100) % 36000
+        place = (round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3))
+        return mav.MAVLink_gps_raw_int_message(
+            self._usec(now), 3, *place, 90, 90, _clamp_int(speed * 100, 0, 65534), course, 16, place[2], 900, 1780, 250
+        )
+
+    def _gps_global_origin(self, now: Snapshot) -> Message:
+        frame = self._frame
+        place = (round(frame.latitude_deg * 1e7), round(frame.longitude_deg * 1e7), round(frame.altitude_m * 1e3))
+        return mav.MAVLink_gps_global_origin_message(*place, self._usec(now))
+
+    def _home_position(self, now: Snapshot) -> Message:
+        home = self._autopilot.home
+        latitude, longitude, altitude = self._frame.to_global(home)
+        place = (round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3))
+        return mav.MAVLink_home_position_message(*place, *home, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, self._usec(now))
+
+    def _highres_imu(self, now: Snapshot) -> Message:
+        field = rotate_to_body(now.attitude, _MAGNETIC_FIELD_NED_GAUSS)
+        pressure_hpa = self._pressure_hpa(now)
+        altitude = self._frame.altitude_m - now.position[2]
+        return mav.MAVLink_highres_imu_message(
+            self._usec(now), *now.specific_force, *now.body_rates, *field, pressure_hpa, 0.0, altitude, 15.0, 0x1FFF, 0
+        )
+
+    def _pressure_hpa(self, now: Snapshot) -> float:
+        """ISA barometric formula below 11 km."""
+        altitude = self._frame.altitude_m - now.position[2]
+        return float(1013.25 * max(1.0 - 2.25577e-5 * altitude, 0.01) ** 5.25588)
+
+    def _scaled_pressure(self, now: Snapshot) -> Message:
+        return mav.MAVLink_scaled_pressure_message(self._msec(now), self._pressure_hpa(now), 0.0, 1500)
+
+    def _servo_output_raw(self, now: Snapshot) -> Message:
+        pulses = [1000 + _clamp_int(1000 * motor, 0, 1000) for motor in now.motors] if self._autopilot.armed else [900] * 4
+        return mav.MAVLink_servo_output_raw_message(self._usec(now) & 0xFFFFFFFF, 0, *pulses, 0, 0, 0, 0)
+
+    def _vibration(self, now: Snapshot) -> Message:
+        return mav.MAVLink_vibration_message(self._usec(now), 0.0, 0.0, 0.0, 0, 0, 0)
