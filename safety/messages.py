@@ -69,7 +69,11 @@ class Intervention:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Why the command sent is what it is. `braking`: the wanted command was refused and zero velocity is sent."""
+    """Why the command sent is what it is.
+
+    `braking`: the wanted command was refused and zero velocity is sent. `fault`: the rule that found the input or the filter
+    itself unfit (escalates, see `safety.escalation`); None when braking is for a fence or an obstacle, or not at all.
+    """
 
     braking: bool
     interventions: tuple[Intervention, ...] = ()
@@ -77,6 +81,7 @@ class Verdict:
     state_age_s: float = float("nan")
     clearance_m: float = float("nan")
     fence_margin_m: float = float("nan")
+    fault: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

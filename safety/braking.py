@@ -1,0 +1,126 @@
+"""The brake tube: where the vehicle goes when a command is sent for one tick and zero velocity ever after.
+
+Two models of the velocity loop bound the real one: a slow one (it keeps flying longer) and a fast one (it speeds up sooner);
+both brake with the slow one. For a first-order lag tau the stop point is exact and linear: p + v tau + (integral of the commands
+still in flight), so braking never moves it, which makes "brake" the trajectory already proved.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safety.config import SafetyConfig
+from safety.frames import CorridorVector
+from safety.messages import VehicleState
+
+Floats = NDArray[np.float64]
+HISTORY = 64
+
+
+class CommandHistory:
+    """The commands already sent, newest last, in fixed space: those still in flight are part of the state."""
+
+    def __init__(self) -> None:
+        self._sent: deque[tuple[float, CorridorVector]] = deque(maxlen=HISTORY)
+
+    def clear(self) -> None:
+        """Forget everything: the vehicle was not under this filter's command."""
+        self._sent.clear()
+
+    def add(self, time_s: float, velocity: CorridorVector) -> None:
+        """Remember a velocity command sent at a time."""
+        self._sent.append((time_s, velocity))
+
+    def phases(self, begin_s: float, end_s: float, before: CorridorVector) -> list[tuple[float, CorridorVector]]:
+        """Durations and commands that cover [begin_s, end_s]; `before` is taken for times older than the history."""
+        result: list[tuple[float, CorridorVector]] = []
+        end = end_s
+        for time_s, velocity in reversed(self._sent):
+            start = max(time_s, begin_s)
+            if start < end:
+                result.append((end - start, velocity))
+                end = start
+            if end <= begin_s:
+                break
+        if end > begin_s:
+            result.append((end - begin_s, before))
+        result.reverse()
+        return result
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where a new command begins to act: position and velocity [2 models, 3], corridor frame. Row 0 slow, row 1 fast."""
+
+    position_m: Floats
+    velocity_m_s: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Tubes:
+    """Brake tubes of c candidate commands: polylines begin -> turn -> stop, each [2 models, c, 3], corridor frame, m."""
+
+    begin_m: Floats
+    turn_m: Floats
+    stop_m: Floats
+
+
+def predict_start(state: VehicleState, history: CommandHistory, now_s: float, config: SafetyConfig) -> Start:
+    """Fly the estimate through the commands already sent, up to the moment at which a command sent now begins to act."""
+    phases = history.phases(state.time_s - config.dead_time_s, now_s, state.velocity)
+    position, velocity = np.empty((2, 3)), np.empty((2, 3))
+    for row, lag_s in enumerate((config.lag_s, config.lag_min_s)):
+        p, v = state.position, state.velocity
+        for duration_s, command in phases:
+            p, v = _follow(p, v, command, lag_s, duration_s)
+        position[row] = (p.x, p.y, p.z)
+        velocity[row] = (v.x, v.y, v.z)
+    return Start(position, velocity)
+
+
+def _follow(
+    p: CorridorVector, v: CorridorVector, command: CorridorVector, lag_s: float, duration_s: float
+) -> tuple[CorridorVector, CorridorVector]:
+    """One phase of a first-order velocity loop under a constant command."""
+    left = math.exp(-duration_s / lag_s)
+    gone = lag_s * (1.0 - left)
+    dx, dy, dz = v.x - command.x, v.y - command.y, v.z - command.z
+    position = CorridorVector(
+        p.x + command.x * duration_s + dx * gone,
+        p.y + command.y * duration_s + dy * gone,
+        p.z + command.z * duration_s + dz * gone,
+    )
+    return position, CorridorVector(command.x + dx * left, command.y + dy * left, command.z + dz * left)
+
+
+def tubes(start: Start, candidates_m_s: Floats, config: SafetyConfig) -> Tubes:
+    """Brake tubes of candidate velocity commands [c, 3] held for one tick from `start`."""
+    lags = np.array((config.lag_s, config.lag_min_s))[:, None, None]
+    left = np.exp(-config.tick_s / lags)
+    begin = np.broadcast_to(start.position_m[:, None, :], (2, *candidates_m_s.shape))
+    rest = start.velocity_m_s[:, None, :] - candidates_m_s
+    turn = begin + candidates_m_s * config.tick_s + rest * (lags * (1.0 - left))
+    velocity = candidates_m_s + rest * left
+    return Tubes(begin, turn, turn + velocity * _stop_times_s(velocity, config))
+
+
+def _stop_times_s(velocity_m_s: Floats, config: SafetyConfig) -> Floats:
+    """Braking distance over speed, vectors with last axis 3: the lag, more when the deceleration limit binds, s."""
+    speed = np.sqrt(np.einsum("...i,...i->...", velocity_m_s, velocity_m_s))[..., None]
+    knee = config.braking_m_s2 * config.lag_s
+    fast = np.maximum(speed, knee)
+    times: Floats = (fast * fast + knee * knee) / (2.0 * config.braking_m_s2 * fast)
+    return times
+
+
+def stop_gain_s(config: SafetyConfig) -> float:
+    """How far, at most, the stop point moves per m/s of a command held for one tick, s (unsaturated loop)."""
+    gains = (
+        config.tick_s + (1.0 - math.exp(-config.tick_s / lag)) * (config.lag_s - lag) for lag in (config.lag_s, config.lag_min_s)
+    )
+    return max(gains)

@@ -1,0 +1,134 @@
+"""What the safety layer is told: limits, fence, vehicle, and the assumptions under which its guarantee holds.
+
+Every number is finite and checked against the others when the object is made, so that a contradiction is refused on the
+ground (faults G1, G2 and G6 of docs/safety.md) and cannot surprise in flight.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Positive = Annotated[float, Field(gt=0.0, le=1000.0)]
+NotNegative = Annotated[float, Field(ge=0.0, le=1000.0)]
+Corner = tuple[float, float, float]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Fence(_Frozen):
+    """A box the whole vehicle stays inside: two opposite corners (x, y, z) in the corridor frame, m.
+
+    The z coordinates are the altitude floor and ceiling (corridor z, 0 = ground at the corridor's origin).
+    """
+
+    min_m: Corner
+    max_m: Corner
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for axis, low, high in zip("xyz", self.min_m, self.max_m, strict=True):
+            if low >= high:
+                raise ValueError(f"fence {axis}: min_m {low} must be smaller than max_m {high}")
+        return self
+
+
+class SafetyConfig(_Frozen):
+    """Limits, geometry and assumptions of `SafetyFilter`. SI units, corridor frame."""
+
+    fence: Fence
+
+    max_horizontal_speed_m_s: Positive = Field(1.2, description="longest horizontal velocity command")
+    max_vertical_speed_m_s: Positive = Field(0.5, description="largest vertical velocity command, either way")
+    max_acceleration_m_s2: Positive = Field(10.0, description="how fast a command may grow or turn; slowing down is free")
+    max_yaw_rate_rad_s: Positive = Field(1.0, description="largest yaw rate command, either way")
+
+    vehicle_radius_m: Positive = Field(0.35, description="A5: the vehicle fits into this horizontal circle")
+    vehicle_half_height_m: Positive = Field(0.1, description="the vehicle reaches this far above and below its position")
+    margin_m: NotNegative = Field(0.04, description="distance kept beyond everything that is accounted for")
+
+    tick_s: Positive = Field(0.05, description="A3: time between two calls")
+    dead_time_s: NotNegative = Field(0.2, description="A3: from sending a command until the vehicle begins to follow it")
+    lag_s: Positive = Field(0.7, description="A3: slowest first-order lag of the velocity loop (used to brake)")
+    lag_min_s: Positive = Field(0.4, description="A2: fastest lag of the velocity loop (used to speed up)")
+    braking_m_s2: Positive = Field(2.0, description="A1: deceleration that is always available")
+    position_error_m: NotNegative = Field(0.05, description="A4: bound of the position error, per axis")
+    velocity_error_m_s: NotNegative = Field(0.05, description="A4: bound of the velocity error, per axis")
+    obstacle_speed_m_s: NotNegative = Field(0.0, description="A6: obstacles move no faster than this; 0 = they stand still")
+
+    scan_stale_s: Positive = Field(0.25, description="a scan older than this is no scan")
+    state_stale_s: Positive = Field(0.2, description="a state estimate older than this is no estimate")
+    future_tolerance_s: NotNegative = Field(0.02, description="a stamp this far ahead of the clock is still accepted")
+
+    blind_speed_m_s: NotNegative = Field(0.3, description="speed allowed into directions the LiDAR does not see")
+    return_speed_m_s: Positive = Field(0.3, description="speed allowed while nearer than the margin or outside the fence")
+    fov_margin_rad: NotNegative = Field(0.1, description="this much of each edge of the field of view counts as unseen")
+    memory_s: NotNegative = Field(20.0, description="returns that left the field of view are remembered this long")
+    memory_hold_s: NotNegative = Field(0.12, description="a return is kept this long although newer scans look past it")
+    ground_z_m: float = Field(0.0, description="corridor z of the ground; returns this low are the ground, not obstacles")
+    ground_band_m: NotNegative = Field(0.2, description="height above the ground up to which a tilted beam's return is ground")
+
+    @property
+    def delay_s(self) -> float:
+        """Total blind time T of the formulas: dead time, one tick of hold, and the lag of the velocity loop, s."""
+        return self.dead_time_s + self.tick_s + self.lag_s
+
+    @property
+    def keep_out_m(self) -> float:
+        """Distance the vehicle's centre keeps from an obstacle, before estimate errors are added, m."""
+        return self.vehicle_radius_m + self.margin_m
+
+    def keep_in(self) -> tuple[Corner, Corner]:
+        """The fence eroded by vehicle, position error and margin: where the vehicle's centre may be, two corners, m."""
+        side = self.vehicle_radius_m + self.position_error_m + self.margin_m
+        height = self.vehicle_half_height_m + self.position_error_m + self.margin_m
+        (x0, y0, z0), (x1, y1, z1) = self.fence.min_m, self.fence.max_m
+        return (x0 + side, y0 + side, z0 + height), (x1 - side, y1 - side, z1 - height)
+
+    def stop_distance_m(self, speed_m_s: float) -> float:
+        """Distance flown from a speed until standstill, dead time and tick included, m. Grows with the speed."""
+        return speed_m_s * (self.dead_time_s + self.tick_s) + braking_distance_m(speed_m_s, self.lag_s, self.braking_m_s2)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        for low, high in (
+            ("lag_min_s", "lag_s"),
+            ("blind_speed_m_s", "max_horizontal_speed_m_s"),
+            ("return_speed_m_s", "max_horizontal_speed_m_s"),
+            ("memory_hold_s", "memory_s"),
+        ):
+            if getattr(self, low) > getattr(self, high):
+                raise ValueError(f"{low} {getattr(self, low)} must not exceed {high} {getattr(self, high)}")
+        for axis, inner_low, inner_high in zip("xyz", *self.keep_in(), strict=True):
+            if inner_low >= inner_high:
+                raise ValueError(
+                    f"fence {axis}: nothing is left of the fence after radius, position error and margin are taken off; widen it"
+                )
+        return self
+
+
+def braking_distance_m(speed_m_s: float, lag_s: float, braking_m_s2: float) -> float:
+    """Distance of a first-order velocity loop with lag tau and deceleration limit b from a speed to zero, m.
+
+    v tau while v <= b tau; above, the loop is saturated first: (v^2 - (b tau)^2) / (2 b) + b tau^2.
+    """
+    knee = braking_m_s2 * lag_s
+    if speed_m_s <= knee:
+        return speed_m_s * lag_s
+    return (speed_m_s * speed_m_s - knee * knee) / (2.0 * braking_m_s2) + knee * lag_s
+
+
+def speed_cap_m_s(distance_m: float, delay_s: float, braking_m_s2: float) -> float:
+    """Highest speed that can stop within a distance, m/s: min of b (sqrt(T^2 + 2 D / b) - T) and D / (e T); 0 for D <= 0.
+
+    The second term keeps the approach free of overshoot under the delay. Needed, not sufficient in two dimensions:
+    the brake tube decides, this is its quick bound and its oracle in tests.
+    """
+    if distance_m <= 0.0:
+        return 0.0
+    parabola = braking_m_s2 * (math.sqrt(delay_s * delay_s + 2.0 * distance_m / braking_m_s2) - delay_s)
+    return min(parabola, distance_m / (math.e * delay_s))

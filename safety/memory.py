@@ -1,0 +1,77 @@
+"""A short memory of obstacle points in the corridor frame, in fixed space.
+
+A return is forgotten when a newer scan sees something at its place (the newer return replaces it), when newer scans have looked
+past it for longer than one drop-out lasts, when it is older than the memory, or when it is too far away to matter. What left the
+field of view, or is hidden behind something nearer, stays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safety.config import SafetyConfig
+from safety.lidar import SeenScan, scan_offset
+
+Floats = NDArray[np.float64]
+CAPACITY = 2048
+SAME_PLACE_M = 0.2  # a return this close to a remembered one, along its beam, is the same thing seen again
+
+
+class ObstacleMemory:
+    """At most `CAPACITY` points, oldest first; when full the oldest go."""
+
+    def __init__(self) -> None:
+        self._points = np.empty((4, CAPACITY))  # rows: x, y, spread, time of sight
+        self._count = 0
+
+    def clear(self) -> None:
+        """Forget all points."""
+        self._count = 0
+
+    @property
+    def count(self) -> int:
+        """Number of points held."""
+        return self._count
+
+    def update(self, seen: SeenScan, reach_m: float, config: SafetyConfig) -> None:
+        """Take in a new scan: drop what it looked at again or what is old or out of reach, add its returns."""
+        old = self._points[:, : self._count]
+        if self._count:
+            old = old[:, self._kept(seen, reach_m, config)]
+        near = (seen.x_m - seen.origin_x_m) ** 2 + (seen.y_m - seen.origin_y_m) ** 2 < reach_m * reach_m
+        new = np.empty((4, int(np.count_nonzero(near))))
+        new[0], new[1], new[2], new[3] = seen.x_m[near], seen.y_m[near], seen.spread_m[near], seen.time_s
+        new = new[:, :CAPACITY]
+        old = old[:, max(0, old.shape[1] + new.shape[1] - CAPACITY) :]
+        split, end = old.shape[1], old.shape[1] + new.shape[1]
+        self._points[:, :split] = old.copy()
+        self._points[:, split:end] = new
+        self._count = end
+
+    def _kept(self, seen: SeenScan, reach_m: float, config: SafetyConfig) -> NDArray[np.bool_]:
+        x, y, _, time_s = self._points[:, : self._count]
+        dx, dy = x - seen.origin_x_m, y - seen.origin_y_m
+        distance = np.sqrt(dx * dx + dy * dy)
+        young = time_s >= seen.time_s - config.memory_s
+        held = time_s >= seen.time_s - config.memory_hold_s
+        reach = self._reach(seen, np.arctan2(dy, dx))
+        replaced = np.abs(reach - distance) <= SAME_PLACE_M
+        passed = reach > distance
+        kept: NDArray[np.bool_] = young & (distance < reach_m) & ~replaced & (held | ~passed)
+        return kept
+
+    @staticmethod
+    def _reach(seen: SeenScan, direction_rad: Floats) -> Floats:
+        """How far the beam in each direction [k] saw: inf = nothing there, nan = no beam or an unknown one, m."""
+        beam = np.rint(scan_offset(seen, direction_rad - seen.yaw_rad) / seen.angle_increment_rad)
+        inside = beam < seen.range_m.shape[0]
+        reach: Floats = np.where(inside, seen.range_m[np.where(inside, beam, 0.0).astype(np.intp)], np.nan)
+        return reach
+
+    def points(self, now_s: float, config: SafetyConfig) -> tuple[Floats, Floats, Floats]:
+        """Coordinates x, y [k] and the extra radius [k] each point has by beam width, age, drift and own motion, m."""
+        x, y, spread, time_s = self._points[:, : self._count]
+        age = np.maximum(now_s - time_s, 0.0)
+        drift = np.minimum(age * config.velocity_error_m_s, config.position_error_m)
+        return x, y, spread + drift + age * config.obstacle_speed_m_s

@@ -1,0 +1,136 @@
+"""Is the input fit to fly on? Freshness, finiteness and plausibility of command, state and scan, each with its own rule name.
+
+`InputMonitor.judge` returns the first fault found, or None. A fault always means BRAKE; see `safety.escalation` for what follows.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safety.config import SafetyConfig
+from safety.frames import CorridorVector
+from safety.lidar import scan_problem
+from safety.messages import Intervention, LidarScan, VehicleState, VelocityCommand
+
+FROZEN_SCANS = 3
+FROZEN_SPEED_M_S = 0.3
+FROZEN_YAW_RATE_RAD_S = 0.2
+MOST_BEAMS = 0.5  # share of beams that no real scene turns unknown or touching at once
+WALL_SHARE = 0.1  # a scan with at least this share of near returns cannot be followed by an empty one
+WALL_RANGE = 0.75  # near, as a share of range_max
+
+
+def _finite(vector: CorridorVector) -> bool:
+    return math.isfinite(vector.x) and math.isfinite(vector.y) and math.isfinite(vector.z)
+
+
+def command_fault(command: VelocityCommand | None) -> Intervention | None:
+    """A missing or non-finite policy command (P1, P4)."""
+    if command is None:
+        return Intervention("command_missing", math.nan, math.nan)
+    if not (_finite(command.velocity) and math.isfinite(command.yaw_rate_rad_s)):
+        return Intervention("command_not_finite", math.nan, math.nan)
+    return None
+
+
+def age_fault(name: str, age_s: float, stale_s: float, future_s: float) -> Intervention | None:
+    """A stamp that is too old (L1, E3) or ahead of the clock (L10)."""
+    if not age_s <= stale_s:  # NaN fails too
+        return Intervention(f"{name}_stale", age_s, stale_s)
+    if age_s < -future_s:
+        return Intervention(f"{name}_future", age_s, -future_s)
+    return None
+
+
+def state_fault(state: VehicleState | None, now_s: float, config: SafetyConfig) -> Intervention | None:
+    """A missing, non-finite (E4), stale or future state estimate."""
+    if state is None:
+        return Intervention("state_missing", math.nan, math.nan)
+    angles = (state.roll_rad, state.pitch_rad, state.yaw_rad, state.yaw_rate_rad_s)
+    vectors = (state.position, state.velocity, state.acceleration)
+    if not (all(map(_finite, vectors)) and all(map(math.isfinite, angles))):
+        return Intervention("state_not_finite", math.nan, math.nan)
+    return age_fault("state", now_s - state.time_s, config.state_stale_s, config.future_tolerance_s)
+
+
+class InputMonitor:
+    """Judges one tick's input; keeps the previous stamps and the previous scan, no more."""
+
+    def __init__(self, config: SafetyConfig) -> None:
+        self._config = config
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget earlier input."""
+        self._now_s = -math.inf
+        self._state_time_s = -math.inf
+        self._scan_time_s = -math.inf
+        self._ranges: NDArray[np.floating] | None = None
+        self._frozen = 0
+        self._walled = False
+
+    def judge(
+        self, command: VelocityCommand | None, state: VehicleState | None, scan: LidarScan | None, now_s: float
+    ) -> Intervention | None:
+        """The first fault of this tick's input, or None. `now_s`: the caller's monotonic clock."""
+        if not now_s >= self._now_s:  # NaN fails too
+            return Intervention("clock_backwards", now_s, self._now_s)
+        if not math.isfinite(now_s):
+            return Intervention("clock_not_finite", now_s, math.nan)
+        self._now_s = now_s
+        return state_fault(state, now_s, self._config) or self._scan_fault(scan, state, now_s) or command_fault(command) or (
+            self._order_fault(state)
+        )  # fmt: skip
+
+    def _order_fault(self, state: VehicleState | None) -> Intervention | None:
+        """A state older than one already used (K5): the estimate went back in time."""
+        assert state is not None  # judged before
+        if state.time_s < self._state_time_s:
+            return Intervention("state_backwards", state.time_s, self._state_time_s)
+        self._state_time_s = state.time_s
+        return None
+
+    def _scan_fault(self, scan: LidarScan | None, state: VehicleState | None, now_s: float) -> Intervention | None:
+        if scan is None:
+            return Intervention("scan_missing", math.nan, math.nan)
+        problem = scan_problem(scan)
+        if problem is not None:
+            return Intervention(problem, math.nan, math.nan)
+        fault = age_fault("scan", now_s - scan.time_s, self._config.scan_stale_s, self._config.future_tolerance_s)
+        if fault is not None:
+            return fault
+        if scan.time_s < self._scan_time_s:
+            return Intervention("scan_backwards", scan.time_s, self._scan_time_s)
+        return self._content_fault(scan) or self._frozen_fault(scan, state)
+
+    def _content_fault(self, scan: LidarScan) -> Intervention | None:
+        """Whole-scan failures: mostly NaN (L6), mostly touching (L5), suddenly empty although walls were near (L4)."""
+        ranges, beams = scan.ranges_m, scan.ranges_m.shape[0]
+        unknown = np.count_nonzero(np.isnan(ranges)) / beams
+        if unknown > MOST_BEAMS:
+            return Intervention("scan_unknown", unknown, MOST_BEAMS)
+        touching = np.count_nonzero(ranges < scan.range_min_m) / beams
+        if touching > MOST_BEAMS:
+            return Intervention("scan_touching", touching, MOST_BEAMS)
+        near = np.count_nonzero(ranges < WALL_RANGE * scan.range_max_m) / beams
+        if self._walled and near == 0.0 and bool(np.all(ranges >= scan.range_max_m)):
+            return Intervention("scan_blank", near, WALL_SHARE)
+        self._walled = near >= WALL_SHARE
+        return None
+
+    def _frozen_fault(self, scan: LidarScan, state: VehicleState | None) -> Intervention | None:
+        """Bit-identical scans with new stamps while the vehicle moves (L2). Empty scans are alike by right."""
+        assert state is not None  # judged before
+        if scan.time_s > self._scan_time_s:
+            same = self._ranges is not None and np.array_equal(scan.ranges_m, self._ranges) and np.isfinite(scan.ranges_m).any()
+            self._frozen = self._frozen + 1 if same else 0
+            self._ranges = scan.ranges_m.copy()
+            self._scan_time_s = scan.time_s
+        speed = math.hypot(state.velocity.x, state.velocity.y)
+        moving = speed > FROZEN_SPEED_M_S or abs(state.yaw_rate_rad_s) > FROZEN_YAW_RATE_RAD_S
+        if self._frozen >= FROZEN_SCANS and moving:
+            return Intervention("scan_frozen", float(self._frozen), float(FROZEN_SCANS))
+        return None

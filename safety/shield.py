@@ -1,0 +1,227 @@
+"""Fence and obstacles together: the nearest command whose brake tube stays inside one and clear of the other.
+
+A command passes when its brake tube (safety.braking) is nowhere nearer to a known obstacle, and nowhere further out of the eroded
+fence, than allowed. Allowed is the keep-out distance, or, where even braking cannot hold it (bad start, drift, an obstacle that
+appears), whatever braking reaches: a violation may not grow, and every way out of it stays open.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safety.braking import Start, Tubes, stop_gain_s, tubes
+from safety.config import SafetyConfig
+from safety.frames import CorridorVector
+from safety.lidar import SeenScan, blind
+from safety.messages import Intervention
+
+Floats = NDArray[np.float64]
+EPSILON_M = 1e-9  # rounding of one tube check
+SCALES = (0.8, 0.6, 0.4, 0.2, 0.1, 0.05)
+TURNS_RAD = tuple(math.radians(angle) for angle in (15.0, 30.0, 45.0, 60.0, 75.0, 85.0))
+OUTWARD = (0.0, 0.1)
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What the shield knows this tick: obstacle points [k] with extra radius, the scan for the view, pose, start of control."""
+
+    x_m: Floats
+    y_m: Floats
+    extra_m: Floats
+    seen: SeenScan
+    position: CorridorVector
+    yaw_rad: float
+    start: Start
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """The chosen velocity, and why it is not the wanted one. `clearance_m`: now, hull to nearest known point."""
+
+    velocity: CorridorVector
+    interventions: tuple[Intervention, ...]
+    clearance_m: float
+    fence_margin_m: float
+
+
+class Shield:
+    """Chooses among the wanted command and a fixed number of scaled, turned and projected ones."""
+
+    def __init__(self, config: SafetyConfig) -> None:
+        self._config = config
+        low, high = config.keep_in()
+        self._low, self._high = np.array(low), np.array(high)
+        self._gain_s = stop_gain_s(config)
+        directions = [(scale, 0.0) for scale in SCALES]
+        directions += [(math.cos(turn), sign * turn) for turn in TURNS_RAD for sign in (1, -1)]
+        self._scaled = np.array([(scale * math.cos(turn), scale * math.sin(turn)) for scale, turn in directions])
+
+    def choose(self, wanted: CorridorVector, around: Surroundings) -> Decision:
+        """The wanted velocity itself when it is safe (same object), else the nearest safe candidate, else zero."""
+        clearance, fence_margin = self._clearance_now(around), self._fence_margin(around.position)
+        around = self._within_reach(around)
+        nothing = np.array((wanted.x, wanted.y, wanted.z))
+        first = np.stack((nothing, np.zeros(3)))
+        found: list[Intervention] = []
+        first[0] = self._view_capped(first[:1], around, clearance, fence_margin, found)[0]
+        passed, brake = self._judge(first, around, found)
+        if passed:
+            if not found:
+                return Decision(wanted, (), clearance, fence_margin)
+            return Decision(_vector(first[0]), tuple(found), clearance, fence_margin)
+        chosen = self._nearest(first[0], around, brake, clearance, fence_margin)
+        return Decision(_vector(chosen), tuple(found), clearance, fence_margin)
+
+    def _clearance_now(self, around: Surroundings) -> float:
+        """Distance between the hull and the nearest known point, or as much as the sensor could have seen, m."""
+        if around.x_m.shape[0] == 0:
+            return math.inf
+        dx, dy = around.x_m - around.position.x, around.y_m - around.position.y
+        return math.sqrt(float(np.min(dx * dx + dy * dy))) - self._config.vehicle_radius_m
+
+    def _within_reach(self, around: Surroundings) -> Surroundings:
+        """Only the points that some tube of this tick can come near to: the others cannot change a decision."""
+        config, start = self._config, around.start
+        fast = (
+            max(math.hypot(v[0], v[1]) for v in start.velocity_m_s)
+            + config.max_horizontal_speed_m_s * config.tick_s / config.lag_min_s
+        )
+        apart = math.dist(start.position_m[0, :2], start.position_m[1, :2])
+        errors = config.velocity_error_m_s * config.delay_s + config.obstacle_speed_m_s * config.delay_s
+        reach = (
+            config.keep_out_m + apart + errors + config.stop_distance_m(fast + config.max_horizontal_speed_m_s * config.tick_s)
+        )
+        dx, dy = around.x_m - start.position_m[0, 0], around.y_m - start.position_m[0, 1]
+        near = dx * dx + dy * dy < (reach + around.extra_m) ** 2
+        return dataclasses.replace(around, x_m=around.x_m[near], y_m=around.y_m[near], extra_m=around.extra_m[near])
+
+    def _fence_margin(self, position: CorridorVector) -> float:
+        """Smallest distance of the vehicle's centre to a face of the eroded fence, negative outside, m."""
+        p = (position.x, position.y, position.z)
+        return float(min(min(p[i] - self._low[i], self._high[i] - p[i]) for i in range(3)))
+
+    def _view_capped(
+        self, candidates: Floats, around: Surroundings, clearance_m: float, fence_margin_m: float, found: list[Intervention]
+    ) -> Floats:
+        """Shorten horizontal vectors [c, 3] that point where nothing is seen, and all of them while inside a margin."""
+        config = self._config
+        speed = np.hypot(candidates[:, 0], candidates[:, 1])
+        unseen = blind(around.seen, np.arctan2(candidates[:, 1], candidates[:, 0]), around.yaw_rad, config)
+        limit = np.where(unseen, config.blind_speed_m_s, math.inf)
+        returning = clearance_m < config.margin_m or fence_margin_m < 0.0
+        if returning:
+            limit = np.minimum(limit, config.return_speed_m_s)
+        over = speed > limit
+        if not over.any():
+            return candidates
+        rule = "return_speed" if returning else "blind_speed"
+        found.append(Intervention(rule, float(speed[over][0]), float(limit[over][0])))
+        factor = np.where(over, limit / np.where(over, speed, 1.0), 1.0)
+        capped: Floats = candidates * np.stack((factor, factor, np.ones_like(factor)), axis=1)
+        return capped
+
+    def _judge(self, first: Floats, around: Surroundings, found: list[Intervention]) -> tuple[bool, _Allowed]:
+        """Judge the wanted command (row 0) against the allowance that braking (row 1) sets."""
+        tube = tubes(around.start, first, self._config)
+        clear, fence = self._tube_clearances(tube, around), self._tube_fence(tube)
+        allowed = _Allowed(min(0.0, float(clear[1])), np.minimum(0.0, fence[1]), tube.stop_m[:, 1])
+        obstacle_ok = float(clear[0]) >= allowed.clearance_m - EPSILON_M
+        face = int(np.argmin(fence[0] - allowed.fence_m))
+        fence_ok = float(fence[0, face]) >= float(allowed.fence_m[face]) - EPSILON_M
+        if not fence_ok:
+            found.append(Intervention("fence", float(fence[0, face]), float(allowed.fence_m[face])))
+        if not obstacle_ok:
+            found.append(Intervention("obstacle", float(clear[0]), allowed.clearance_m))
+        return obstacle_ok and fence_ok, allowed
+
+    def _nearest(
+        self, wanted: Floats, around: Surroundings, allowed: _Allowed, clearance_m: float, fence_margin_m: float
+    ) -> Floats:
+        """Of all candidates that pass, the one nearest to the wanted vector [3]; zeros when none passes."""
+        candidates = self._fenced(self._candidates(wanted, around, allowed), allowed)
+        candidates = self._view_capped(candidates, around, clearance_m, fence_margin_m, [])
+        tube = tubes(around.start, candidates, self._config)
+        fence_ok = (self._tube_fence(tube) >= allowed.fence_m - EPSILON_M).all(axis=1)
+        passed = fence_ok & (self._tube_clearances(tube, around) >= allowed.clearance_m - EPSILON_M)
+        away = candidates - wanted
+        cost = np.where(passed, np.einsum("ci,ci->c", away, away), math.inf)
+        best = int(np.argmin(cost))
+        return candidates[best] if passed[best] else np.zeros(3)
+
+    def _candidates(self, wanted: Floats, around: Surroundings, allowed: _Allowed) -> Floats:
+        """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""
+        x, y, z = wanted
+        a, b = self._scaled[:, 0], self._scaled[:, 1]
+        rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], np.array([[0.0, 0.0, z]])]
+        if around.x_m.shape[0]:
+            rows += [self._slid(wanted, around, stop) for stop in allowed.stop_m]
+        return np.concatenate(rows)
+
+    def _slid(self, wanted: Floats, around: Surroundings, stop_m: Floats) -> Floats:
+        """The wanted vector without its part towards the point nearest to where braking ends, [2, 3]."""
+        dx, dy = stop_m[0] - around.x_m, stop_m[1] - around.y_m
+        distance = np.hypot(dx, dy)
+        nearest = int(np.argmin(distance - around.extra_m))
+        normal = np.array((dx[nearest], dy[nearest], 0.0)) / max(float(distance[nearest]), EPSILON_M)
+        inward, length = min(0.0, float(wanted @ normal)), math.hypot(wanted[0], wanted[1])
+        return np.stack([wanted - (inward - share * length) * normal for share in OUTWARD])
+
+    def _fenced(self, candidates: Floats, allowed: _Allowed) -> Floats:
+        """Candidates with each axis shortened so far that its stop point stays inside the box (faces are independent axes)."""
+        above = np.maximum(0.0, (self._high - allowed.stop_m).min(axis=0)) / self._gain_s
+        below = np.maximum(0.0, (allowed.stop_m - self._low).min(axis=0)) / self._gain_s
+        clipped: Floats = np.minimum(np.maximum(candidates, -below), above)
+        return clipped
+
+    def _tube_fence(self, tube: Tubes) -> Floats:
+        """Smallest distance inside each face of the eroded fence over a tube's corners, [c, 6], negative outside, m."""
+        corners = np.concatenate((tube.turn_m, tube.stop_m))
+        return np.concatenate(((corners - self._low).min(axis=0), (self._high - corners).min(axis=0)), axis=1)
+
+    def _tube_clearances(self, tube: Tubes, around: Surroundings) -> Floats:
+        """Smallest distance beyond keep-out between each tube [c] and all known points, m; inf without points."""
+        count = tube.stop_m.shape[1]
+        if around.x_m.shape[0] == 0:
+            return np.full(count, math.inf)
+        config, error = self._config, self._config.velocity_error_m_s
+        # the way from begin to turn is one tick long: begin is past choosing, turn is judged as the leg's begin
+        turned = error * (config.dead_time_s + config.tick_s)
+        stopped = turned + error * config.lag_s + config.obstacle_speed_m_s * config.delay_s
+        return _leg_clearances(tube.turn_m, tube.stop_m, turned, stopped, around) - config.keep_out_m
+
+
+@dataclass(frozen=True, slots=True)
+class _Allowed:
+    """How far a tube may violate clearance (<= 0) and fence faces [6] (<= 0); where braking ends [2 models, 3]."""
+
+    clearance_m: float
+    fence_m: Floats
+    stop_m: Floats
+
+
+def _leg_clearances(begin_m: Floats, end_m: Floats, error_begin_m: float, error_end_m: float, around: Surroundings) -> Floats:
+    """Smallest distance from straight legs [2 models, c, 3] to the points, less errors that grow along the leg, [c], m."""
+    ax, ay = begin_m[..., 0].reshape(-1, 1), begin_m[..., 1].reshape(-1, 1)
+    dx, dy = end_m[..., 0].reshape(-1, 1) - ax, end_m[..., 1].reshape(-1, 1) - ay
+    rx, ry = around.x_m - ax, around.y_m - ay
+    along = (rx * dx + ry * dy) / np.maximum(dx * dx + dy * dy, 1e-12)
+    np.clip(along, 0.0, 1.0, out=along)
+    rx -= along * dx
+    ry -= along * dy
+    distance = np.sqrt(rx * rx + ry * ry)
+    distance -= around.extra_m
+    along *= error_end_m - error_begin_m
+    distance -= along
+    nearest: Floats = distance.min(axis=1) - error_begin_m
+    worst: Floats = nearest.reshape(2, -1).min(axis=0)
+    return worst
+
+
+def _vector(values: Floats) -> CorridorVector:
+    return CorridorVector(float(values[0]), float(values[1]), float(values[2]))
