@@ -25,34 +25,34 @@ class StrictModel(BaseModel):
 class RewardConfig(StrictModel):
     """Weights of the reward's terms; rates are per second, so that they do not depend on the decision rate."""
 
-    scale: float = Field(0.2, gt=0, description="multiplies the sum of all terms, to keep returns of order one")
-    progress_per_m: float = Field(0.5, description="per metre by which the distance to the goal shrank")
-    goal: float = Field(10.0, description="on reaching the goal")
-    contact: float = Field(-10.0, description="on contact or on leaving the altitude band")
-    time_per_s: float = Field(-0.1, description="for every second")
-    proximity_per_s: float = Field(-3.0, description="times (1 - clearance/range)^2 inside proximity_range_m")
-    proximity_range_m: float = Field(0.7, gt=0)
-    smoothness: float = Field(-0.01, description="times the squared change of the normalised action between decisions")
-    blind_motion_per_s: float = Field(-0.5, description="times the squared speed (m/s) by which sideways exceeds forward motion")
+    scale: float = Field(default=0.2, gt=0, description="multiplies the sum of all terms, to keep returns of order one")
+    progress_per_m: float = Field(default=0.5, description="per metre by which the distance to the goal shrank")
+    goal: float = Field(default=10.0, description="on reaching the goal")
+    contact: float = Field(default=-10.0, description="on contact or on leaving the altitude band")
+    time_per_s: float = Field(default=-0.1, description="for every second")
+    proximity_per_s: float = Field(default=-3.0, description="times (1 - clearance/range)^2 inside proximity_range_m")
+    proximity_range_m: float = Field(default=0.7, gt=0)
+    smoothness: float = Field(default=-0.03, description="times the squared change of the normalised action between decisions")
+    blind_motion_per_s: float = Field(default=-0.5, description="times the squared speed (m/s) by which sideways exceeds forward motion")
     path_deviation_per_m_s: float = Field(
-        0.0, description="per metre of distance to the line from start to goal (the article's term)"
+        default=0.0, description="per metre of distance to the line from start to goal (the article's term)"
     )
 
 
 class VehicleRandomisation(StrictModel):
     """Relative half-widths by which vehicle parameters vary from episode to episode, and delays."""
 
-    relative: float = Field(0.15, ge=0, le=0.5, description="mass, inertia, thrust, drag and lag each vary by +- this share")
-    gain_relative: float = Field(0.15, ge=0, le=0.5, description="controller gains vary by +- this share")
-    command_delay_steps: tuple[int, int] = Field((0, 12), description="4 ms steps by which a command takes effect late")
-    scan_age_steps: tuple[int, int] = Field((0, 12), description="4 ms steps by which the scan is older than the tick")
-    wind_mps: Range = Field((0.0, 1.5), description="speed of the constant horizontal wind")
+    relative: float = Field(default=0.15, ge=0, le=0.5, description="mass, inertia, thrust, drag and lag each vary by +- this share")
+    gain_relative: float = Field(default=0.15, ge=0, le=0.5, description="controller gains vary by +- this share")
+    command_delay_steps: tuple[int, int] = Field(default=(0, 12), description="4 ms steps by which a command takes effect late")
+    scan_age_steps: tuple[int, int] = Field(default=(0, 12), description="4 ms steps by which the scan is older than the tick")
+    wind_mps: Range = Field(default=(0.0, 1.5), description="speed of the constant horizontal wind")
 
 
 class EstimateRandomisation(StrictModel):
     """Size of the estimate's errors: most episodes near ``nominal``, some up to the harsh preset."""
 
-    harsh_share: float = Field(0.25, ge=0, le=1, description="share of episodes with errors between nominal and harsh")
+    harsh_share: float = Field(default=0.25, ge=0, le=1, description="share of episodes with errors between nominal and harsh")
     nominal: str = "nominal"
     harsh: str = "px4_sih"
 
@@ -60,20 +60,20 @@ class EstimateRandomisation(StrictModel):
 class EnvironmentConfig(StrictModel):
     """The corridor task as the policy sees it."""
 
-    time_limit_s: float = Field(90.0, gt=0)
-    goal_radius_m: float = Field(0.3, gt=0)
-    vehicle_radius_m: float = Field(0.35, gt=0)
-    altitude_band_m: Range = Field((0.5, 4.5), description="leaving it ends the episode like a contact")
+    time_limit_s: float = Field(default=90.0, gt=0)
+    goal_radius_m: float = Field(default=0.3, gt=0)
+    vehicle_radius_m: float = Field(default=0.35, gt=0)
+    altitude_band_m: Range = Field(default=(0.5, 4.5), description="leaving it ends the episode like a contact")
     start_altitude_m: Range = (1.5, 3.0)
-    start_yaw_rad: float = Field(0.35, ge=0, description="start yaw is uniform within +- this")
-    spread_start_share: float = Field(0.5, ge=0, le=1, description="episodes that start at a free point along the corridor")
+    start_yaw_rad: float = Field(default=0.35, ge=0, description="start yaw is uniform within +- this")
+    spread_start_share: float = Field(default=0.5, ge=0, le=1, description="episodes that start at a free point along the corridor")
     dropout: Range = (0.0, 0.02)
-    lidar_noise_m: float = Field(0.01, ge=0)
+    lidar_noise_m: float = Field(default=0.01, ge=0)
     pillars: tuple[int, int] = (4, 12)
-    moving_share: float = Field(0.0, ge=0, le=1, description="share of corridors with moving pillars")
+    moving_share: float = Field(default=0.0, ge=0, le=1, description="share of corridors with moving pillars")
     moving_pillars: tuple[int, int] = (2, 4)
-    mover_speed_max_mps: float = Field(0.5, gt=0)
-    world_pool: int = Field(2048, ge=1, le=65536, description="corridors kept ready; replaced steadily by new ones")
+    mover_speed_max_mps: float = Field(default=0.5, gt=0)
+    world_pool: int = Field(default=2048, ge=1, le=65536, description="corridors kept ready; replaced steadily by new ones")
     vehicle: VehicleRandomisation = VehicleRandomisation()
     estimate: EstimateRandomisation = EstimateRandomisation()
     reward: RewardConfig = RewardConfig()
@@ -89,20 +89,20 @@ class HoldStage(StrictModel):
 class PpoConfig(StrictModel):
     """The learner: proximal policy optimisation over whole sequences (Schulman et al. 2017)."""
 
-    environments: int = Field(256, ge=1)
-    steps: int = Field(64, ge=1, description="decisions per environment and update; the length of back-propagation through time")
-    epochs: int = Field(4, ge=1)
-    minibatches: int = Field(4, ge=1)
-    gamma_per_tick: float = Field(0.995, gt=0, le=1)
-    gae_lambda: float = Field(0.95, ge=0, le=1)
-    clip: float = Field(0.2, gt=0)
-    value_coefficient: float = Field(0.5, ge=0)
-    entropy_coefficient: Range = Field((0.003, 0.0), description="first and last value, linear in between")
-    max_grad_norm: float = Field(0.5, gt=0)
-    learning_rate: float = Field(3e-4, gt=0)
+    environments: int = Field(default=256, ge=1)
+    steps: int = Field(default=64, ge=1, description="decisions per environment and update; the length of back-propagation through time")
+    epochs: int = Field(default=4, ge=1)
+    minibatches: int = Field(default=4, ge=1)
+    gamma_per_tick: float = Field(default=0.995, gt=0, le=1)
+    gae_lambda: float = Field(default=0.95, ge=0, le=1)
+    clip: float = Field(default=0.2, gt=0)
+    value_coefficient: float = Field(default=0.5, ge=0)
+    entropy_coefficient: Range = Field(default=(0.003, 0.0), description="first and last value, linear in between")
+    max_grad_norm: float = Field(default=0.5, gt=0)
+    learning_rate: float = Field(default=3e-4, gt=0)
     learning_rate_bounds: Range = (2e-5, 2e-3)
-    target_kl: float | None = Field(0.01, description="adapts the learning rate; null keeps it fixed")
-    noise_correlation_per_tick: float = Field(0.9, ge=0, lt=1, description="AR(1) exploration noise; 0 is white noise")
+    target_kl: float | None = Field(default=0.01, description="adapts the learning rate; null keeps it fixed")
+    noise_correlation_per_tick: float = Field(default=0.9, ge=0, lt=1, description="AR(1) exploration noise; 0 is white noise")
     log_std_bounds: Range = (-2.5, 0.5)
     hold: tuple[HoldStage, ...] = (HoldStage(share=0.0, ticks=4), HoldStage(share=0.35, ticks=2), HoldStage(share=0.6, ticks=1))
 
@@ -118,18 +118,18 @@ class PpoConfig(StrictModel):
 class EvaluationConfig(StrictModel):
     """Deterministic flights at 20 Hz on held-out corridors, during and after training."""
 
-    every_decisions: int = Field(1_000_000, ge=1)
-    episodes: int = Field(200, ge=1)
-    seed: int = Field(EVALUATION_SEED_START, ge=EVALUATION_SEED_START)
+    every_decisions: int = Field(default=1_000_000, ge=1)
+    episodes: int = Field(default=200, ge=1)
+    seed: int = Field(default=EVALUATION_SEED_START, ge=EVALUATION_SEED_START)
     estimate: str = "nominal"
 
 
 class TrainingConfig(StrictModel):
     """Everything that decides the result of a run, apart from the machine."""
 
-    seed: int = Field(1, ge=0)
-    decisions: int = Field(30_000_000, ge=1)
-    checkpoint_every_updates: int = Field(10, ge=1)
+    seed: int = Field(default=1, ge=0)
+    decisions: int = Field(default=30_000_000, ge=1)
+    checkpoint_every_updates: int = Field(default=10, ge=1)
     environment: EnvironmentConfig = EnvironmentConfig()
     network: dict[str, Any] = Field(default_factory=dict, description="overrides of policy_export.network.NetworkConfig")
     memory: Literal["lstm", "none"] = "lstm"
