@@ -380,6 +380,10 @@ class TestSocket:
         with pytest.raises(ScipServerError, match=f"{server.port} on 127.0.0.1 is in use"):
             ScipServer(clock, port=server.port).start()
 
+    def test_impossible_port_is_said(self, clock):
+        with pytest.raises(ScipServerError, match="99999"):
+            ScipServer(clock, port=99_999).start()
+
     def test_stop_twice_publish_after_and_port_free_again(self, clock):
         server = ScipServer(clock, port=0)
         with pytest.raises(ScipServerError, match="call start"):
