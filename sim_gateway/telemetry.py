@@ -112,7 +112,7 @@ class Telemetry:
         self._snapshot = snapshot
         self._sequence = 0
         self._builders: dict[str, Callable[[Snapshot], Message]] = {
-            name: getattr(self, f"_{name.lower()}") for name in (*STREAM_RATES_HZ, "AUTOPILOT_VERSION", "PROTOCOL_VERSION")
+            name: getattr(self, f"_{name.lower()}") for name in (*STREAM_RATES_HZ, "AUTOPILOT_VERSION")
         }
         self._names = {getattr(mav, f"MAVLINK_MSG_ID_{name}"): name for name in self._builders}
 
@@ -167,9 +167,6 @@ class Telemetry:
         zeros = [0] * 8
         return mav.MAVLink_autopilot_version_message(59647, 17891328, 17891328, 0, 1, zeros, zeros, zeros, 0, 0, SYSTEM_ID)
 
-    def _protocol_version(self, _: Snapshot) -> Message:
-        return mav.MAVLink_protocol_version_message(200, 100, 200, [0] * 8, [0] * 8)
-
     def _mission_current(self, _: Snapshot) -> Message:
         return mav.MAVLink_mission_current_message(0, 0, mav.MISSION_STATE_NO_MISSION, 0)
 
@@ -177,11 +174,11 @@ class Telemetry:
 
     @staticmethod
     def _usec(now: Snapshot) -> int:
-        return int(round(now.time_s * 1e6))
+        return round(now.time_s * 1e6)
 
     @staticmethod
     def _msec(now: Snapshot) -> int:
-        return int(round(now.time_s * 1e3)) & 0xFFFFFFFF
+        return round(now.time_s * 1e3) & 0xFFFFFFFF
 
     def _system_time(self, now: Snapshot) -> Message:
         return mav.MAVLink_system_time_message(_EPOCH_US + self._usec(now), self._msec(now))

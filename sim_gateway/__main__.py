@@ -1,0 +1,5 @@
+"""``python -m sim_gateway`` is ``sim-gateway``."""
+
+from sim_gateway.cli import main
+
+main()

@@ -1,0 +1,208 @@
+"""The ``sim-gateway`` command."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import signal
+import sys
+import threading
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+
+if TYPE_CHECKING:
+    from sim_gateway.gateway import GatewayConfig
+    from sim_gateway.scene import World
+
+_EPILOG = """
+Examples:
+
+sim-gateway --world configs/worlds/corridor.yaml
+
+sim-gateway --world configs/worlds/corridor.yaml --seed 7 --wind 1,0.5,0 --report runs/truth.json
+
+sim-gateway --world configs/worlds/paper.yaml --onboard-port 14541 --lidar-port 10941 --gcs-port 0
+
+Then connect a MAVSDK client to udpin://127.0.0.1:14540 and a Hokuyo SCIP driver to 127.0.0.1:10940.
+"""
+_HIGHEST_PORT = 65535 - 4020  # the gateway's own ports lie up to this far above the client's
+
+app = typer.Typer(add_completion=False, rich_markup_mode="rich")
+
+
+class Dynamics(StrEnum):
+    """What moves the vehicle."""
+
+    internal = "internal"
+
+
+class Estimate(StrEnum):
+    """How far the vehicle's state estimate is from the truth."""
+
+    nominal = "nominal"
+    none = "none"
+    px4_sih = "px4_sih"
+
+
+class _UsageError(Exception):
+    """A mistake of the user's; one line that says what to change."""
+
+
+@app.command(epilog=_EPILOG)
+def serve(
+    world: Annotated[Path, typer.Option(help="World file (YAML), see configs/worlds/.")],
+    seed: Annotated[int | None, typer.Option(min=0, help="Replaces the world's seed; also seeds noise and gusts.")] = None,
+    start: Annotated[str | None, typer.Option(metavar="X,Y", help="Replaces the world's start, m.")] = None,
+    goal: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Replaces the world's goal, m (only reported).")] = None,
+    dynamics: Annotated[Dynamics, typer.Option(help="Vehicle dynamics.")] = Dynamics.internal,
+    estimate: Annotated[Estimate, typer.Option(help="Errors of the vehicle's own state estimate.")] = Estimate.nominal,
+    wind: Annotated[str, typer.Option(metavar="X,Y,Z", help="Steady wind in the corridor frame, m/s.")] = "0,0,0",
+    heading: Annotated[float, typer.Option(help="Compass heading of the corridor's x axis, degrees.")] = 0.0,
+    onboard_port: Annotated[int, typer.Option(min=1, max=_HIGHEST_PORT, help="UDP port of the onboard client.")] = 14540,
+    gcs_port: Annotated[int, typer.Option(min=0, max=_HIGHEST_PORT, help="UDP port of the ground station; 0: none.")] = 14550,
+    lidar_port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the LiDAR; 0: any free one.")] = 10940,
+    report: Annotated[Path | None, typer.Option(help="Write the true path, contacts and events here (JSON).")] = None,
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Vehicle seconds per second.")] = 1.0,
+    max_time: Annotated[float, typer.Option(min=0.0, help="Stop after this many vehicle seconds; 0: never.")] = 0.0,
+    quit_with_parent: Annotated[
+        bool, typer.Option("--quit-with-parent", help="Stop when stdin closes or the parent dies.")
+    ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Log more, to stderr.")] = False,
+) -> None:
+    """Stand in for PX4-SITL: a simulated vehicle with LiDAR in a world, on MAVLink and SCIP ports of this machine.
+
+    Prints one JSON line to stdout when ready. Ctrl-C or SIGTERM stops it and writes the report.
+    """
+    from strict_yaml import ConfigError
+
+    _log_to_stderr(verbose)
+    try:
+        scene = _load(world, seed, start, goal)
+        from sim_gateway.gateway import GatewayConfig
+
+        config = GatewayConfig(
+            seed=scene.seed,
+            onboard_port=onboard_port,
+            gcs_port=gcs_port,
+            lidar_port=lidar_port,
+            estimate=estimate.value,
+            wind_m_s=_triple("--wind", wind),
+            heading_rad=math.radians(_finite("--heading", heading)),
+            speed=_finite("--speed", speed),
+            max_time_s=max_time or math.inf,
+            report=report,
+        )
+        _serve(scene, config, quit_with_parent)
+    except (_UsageError, ConfigError) as error:
+        _fail(str(error))
+
+
+def _serve(world: World, config: GatewayConfig, quit_with_parent: bool) -> None:
+    from sim_gateway.gateway import Gateway, warm_up
+    from sim_gateway.mavlink_server import PortInUseError
+    from sim_gateway.scip import ScipServerError
+
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    if quit_with_parent:
+        _follow_parent(stop)
+    warm_up(world)
+    try:
+        gateway = Gateway(world, config)
+    except PortInUseError as error:
+        raise _UsageError(f"{error}: stop the program there, or choose another with --onboard-port or --gcs-port") from None
+    except ScipServerError as error:
+        raise _UsageError(f"{error} with --lidar-port") from None
+    with gateway:
+        print(json.dumps(gateway.ready_message()), flush=True)
+        gateway.run(stop)
+
+
+def _follow_parent(stop: threading.Event) -> None:
+    """Set `stop` when stdin ends or this process gets another parent.
+
+    Not by Linux's parent-death signal: that one comes already when the thread that started this process ends.
+    """
+    parent = os.getppid()
+
+    def read_to_end() -> None:
+        while sys.stdin.buffer.read(4096):
+            pass
+        stop.set()
+
+    def watch_parent() -> None:
+        while not stop.wait(0.5):
+            if os.getppid() != parent:
+                stop.set()
+
+    for watcher in (read_to_end, watch_parent):
+        threading.Thread(target=watcher, daemon=True).start()
+
+
+def _load(path: Path, seed: int | None, start: str | None, goal: str | None) -> World:
+    """The world with start and goal replaced, if asked; refuses places inside boxes."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from sim_gateway.collision import clearance_m
+    from sim_gateway.world import load_world
+
+    world = load_world(path, seed)
+    changes = {}
+    if start is not None:
+        x, y = _numbers("--start", start, 2)
+        changes["start"] = (x, y, 0.0)
+    if goal is not None:
+        changes["goal"] = _triple("--goal", goal)
+    for name, point in changes.items():
+        if clearance_m(world.boxes_at(0.0), np.array(point), 0.0) <= 0.0:
+            raise _UsageError(f"--{name} {point} lies inside an obstacle: choose another place")
+    return replace(world, **changes)
+
+
+def _numbers(option: str, text: str, count: int) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise _UsageError(f"{option} {text!r}: give {count} finite numbers separated by commas, without spaces")
+    return values
+
+
+def _triple(option: str, text: str) -> tuple[float, float, float]:
+    x, y, z = _numbers(option, text, 3)
+    return (x, y, z)
+
+
+def _finite(option: str, value: float) -> float:
+    if not math.isfinite(value):
+        raise _UsageError(f"{option} {value}: give a finite number")
+    return value
+
+
+def _log_to_stderr(verbose: bool) -> None:
+    from rich.console import Console
+    from rich.logging import RichHandler
+
+    handler = RichHandler(console=Console(stderr=True), show_path=False)
+    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, format="%(message)s", handlers=[handler])
+    for noisy in ("numba", "asyncio"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+
+
+def _fail(message: str) -> NoReturn:
+    print(f"sim-gateway: {message}", file=sys.stderr)
+    raise typer.Exit(2)
+
+
+def main() -> None:
+    """Entry point."""
+    app()

@@ -1,0 +1,89 @@
+"""The gateway's record of what really happened: true path, contacts, clearance, events; written as one JSON file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+from sim_gateway.autopilot import ModeChange
+from sim_gateway.simulation import Simulation
+
+SAMPLE_STEPS = 12.5  # 20 Hz in steps of 4 ms
+TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "vx", "vy", "vz", "yaw")
+_MAX_ROWS = 72_000  # an hour; then every other row is dropped and the interval doubles
+_MAX_EVENTS = 10_000
+
+
+class FlightRecorder:
+    """Collects from a running simulation. Call `watch` after every step; memory is bounded."""
+
+    def __init__(self, simulation: Simulation, facts: dict[str, Any]) -> None:
+        self._simulation = simulation
+        self._facts = facts
+        self.rows: list[tuple[float, ...]] = []
+        self.events: list[dict[str, Any]] = []
+        self.contacts = 0
+        self.min_clearance_m = math.inf
+        self._touching = False
+        self._interval_steps = SAMPLE_STEPS
+        self._next_sample = 0.0
+
+    def watch(self) -> None:
+        """Take note of the present step. On the ground nothing is a contact."""
+        simulation = self._simulation
+        if not simulation.landed:
+            clearance = simulation.clearance_m
+            self.min_clearance_m = min(self.min_clearance_m, clearance)
+            self.contacts += clearance < 0.0 and not self._touching
+            self._touching = clearance < 0.0
+        if simulation.steps >= self._next_sample:
+            self._sample()
+
+    def _sample(self) -> None:
+        truth = self._simulation.truth
+        row = (truth.time_s, *truth.position_m, *truth.velocity_m_s, truth.yaw_rad)
+        self.rows.append(tuple(round(value, 5) for value in row))
+        if len(self.rows) >= _MAX_ROWS:
+            del self.rows[1::2]
+            self._interval_steps *= 2
+        self._next_sample += self._interval_steps
+
+    def note(self, change: ModeChange) -> None:
+        """A mode change, an arming or a disarming."""
+        if len(self.events) < _MAX_EVENTS:
+            self.events.append(
+                {
+                    "t": round(change.time_s, 3),
+                    "mode": change.mode.px4_name,
+                    "intended": change.intended.px4_name,
+                    "armed": change.armed,
+                    "failsafe": change.failsafe,
+                }
+            )
+
+    def as_dict(self, **timing: float) -> dict[str, Any]:
+        """The report; `timing` is added as it is."""
+        flown = math.isfinite(self.min_clearance_m)
+        return {
+            **self._facts,
+            **timing,
+            "duration_s": round(self._simulation.time_s, 3),
+            "contacts": self.contacts,
+            "min_clearance_m": round(self.min_clearance_m, 5) if flown else None,
+            "events": self.events,
+            "trajectory": {"columns": TRAJECTORY_COLUMNS, "rows": self.rows},
+        }
+
+
+def write_json_atomically(path: Path, content: dict[str, Any]) -> None:
+    """Write beside the target, then rename: a reader sees the old file or the new one, never half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

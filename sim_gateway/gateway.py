@@ -1,0 +1,198 @@
+"""The gateway in real time: one simulated vehicle, its autopilot, its MAVLink links and its LiDAR, paced by the clock."""
+
+from __future__ import annotations
+
+import logging
+import math
+import select
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sim_gateway.flight_report import FlightRecorder, write_json_atomically
+from sim_gateway.lidar import LidarConfig
+from sim_gateway.mavlink_server import MavlinkServer
+from sim_gateway.piloted import PilotedVehicle
+from sim_gateway.scene import Point, World
+from sim_gateway.scip import DEFAULT_PORT, ScipServer
+from sim_gateway.simulation import Simulation, WindConfig, step_at
+from sim_gateway.telemetry import Telemetry
+from sim_gateway.vehicle import STEP_S
+
+# distance from the port a client listens on to the gateway's own port, as in PX4's SITL (14580 - 14540, 18570 - 14550)
+ONBOARD_PORT_OFFSET, GROUND_PORT_OFFSET = 40, 4020
+_GIVE_UP_BACKLOG_S = 0.5
+_MAX_STEPS_PER_TURN = 25
+_LONGEST_WAIT_S = 0.02
+
+_log = logging.getLogger("sim_gateway")
+
+
+@dataclass(frozen=True, slots=True)
+class GatewayConfig:
+    """How to run. Ports are those the clients use; `gcs_port` 0 leaves that link out, `lidar_port` 0 takes a free one."""
+
+    seed: int = 0
+    onboard_port: int = 14540
+    gcs_port: int = 14550
+    lidar_port: int = DEFAULT_PORT
+    estimate: str = "nominal"
+    wind_m_s: Point = (0.0, 0.0, 0.0)
+    heading_rad: float = 0.0
+    speed: float = 1.0
+    max_time_s: float = math.inf
+    report: Path | None = None
+
+
+def _simulation(world: World, config: GatewayConfig) -> Simulation:
+    wind = WindConfig(mean_m_s=config.wind_m_s)
+    return Simulation(world, lidar=LidarConfig.device(), estimate=config.estimate, wind=wind, seed=config.seed)
+
+
+def warm_up(world: World) -> None:
+    """Compile or load every kernel once, on a vehicle of its own, so that no flight waits for the compiler."""
+    simulation = Simulation(world, lidar=LidarConfig.device(), hover_height_m=1.0)
+    simulation.advance(2, (0.0, 0.0, 0.0), 0.0)
+    simulation.advance_motors_off(2)
+    simulation.scan()
+    PilotedVehicle(simulation).snapshot()
+
+
+class Gateway:
+    """Everything that answers on a port. Use as a context manager; `run` returns when asked to stop."""
+
+    def __init__(self, world: World, config: GatewayConfig | None = None) -> None:
+        self.world, self.config = world, config or GatewayConfig()
+        config = self.config
+        self.vehicle = PilotedVehicle(_simulation(world, config), heading_rad=config.heading_rad)
+        pilot, frame = self.vehicle.autopilot, self.vehicle.frame
+        self.recorder = FlightRecorder(self.vehicle.simulation, self._facts())
+        telemetry = Telemetry(pilot, frame, self.vehicle.snapshot)
+        onboard = (config.onboard_port + ONBOARD_PORT_OFFSET, config.onboard_port)
+        ground = (config.gcs_port + GROUND_PORT_OFFSET, config.gcs_port) if config.gcs_port else None
+        self.server = MavlinkServer(pilot, frame, telemetry, onboard, ground)
+        self.lidar = ScipServer(lambda: self.vehicle.time_s, config.lidar_port)
+        self.dropped_s = 0.0
+        self._started_s = math.nan
+        self._scans = 0
+        self._was_armed = False
+        try:
+            self.lidar.start()
+        except Exception:
+            self.server.close()
+            raise
+
+    def __enter__(self) -> Gateway:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free all ports."""
+        self.lidar.stop()
+        self.server.close()
+
+    def ready_message(self) -> dict[str, Any]:
+        """What a program that started the gateway needs to know."""
+        world, config = self.world, self.config
+        return {
+            "ready": True,
+            "onboard_port": config.onboard_port,
+            "gcs_port": config.gcs_port,
+            "lidar_port": self.lidar.port,
+            "start": list(world.start),
+            "start_yaw_rad": world.start_yaw_rad,
+            "goal": list(world.goal),
+            "boxes": world.static_boxes.tolist(),
+        }
+
+    def run(self, stop: threading.Event) -> None:
+        """Pace vehicle time to the clock until `stop` is set or `max_time_s` of vehicle time is over, then write the report."""
+        self._started_s = origin_s = time.monotonic()
+        speed = self.config.speed
+        while not stop.is_set() and self.vehicle.time_s < self.config.max_time_s:
+            behind_s = (time.monotonic() - origin_s) * speed - self.vehicle.time_s
+            if behind_s > _GIVE_UP_BACKLOG_S * speed:
+                origin_s += behind_s / speed
+                self.dropped_s += behind_s / speed
+                _log.warning("%.2f s behind the clock: vehicle time stood still for that long", behind_s / speed)
+                behind_s = 0.0
+            for _ in range(min(int(behind_s / STEP_S), _MAX_STEPS_PER_TURN)):
+                self.step()
+            due_s = origin_s + (self.vehicle.simulation.steps + 1) * STEP_S / speed
+            self._wait(due_s - time.monotonic())
+        self.write_report()
+
+    def _wait(self, seconds: float) -> None:
+        """Sleep until the next step is due; what arrives meanwhile is handled at once."""
+        if seconds <= 0.0:
+            return
+        sockets = [link.socket for link in self.server.links]
+        readable, _, _ = select.select(sockets, [], [], min(seconds, _LONGEST_WAIT_S))
+        if readable:
+            self.server.poll()
+
+    def step(self) -> None:
+        """One physics step of 4 ms with everything that hangs on it."""
+        vehicle = self.vehicle
+        vehicle.advance(1)
+        self.recorder.watch()
+        if vehicle.simulation.steps >= step_at(self._scans * 0.05):
+            self._scans += 1
+            scan = vehicle.simulation.scan()
+            self.lidar.publish(scan.time_s, scan.ranges_m)
+        self.server.poll()
+        self._note_changes()
+
+    def _note_changes(self) -> None:
+        pilot = self.vehicle.autopilot
+        while pilot.mode_changes:
+            change = pilot.mode_changes.popleft()
+            self.recorder.note(change)
+            armed = "armed" if change.armed else "disarmed"
+            _log.info("%.2f s: %s, %s%s", change.time_s, change.mode.px4_name, armed, ", failsafe" if change.failsafe else "")
+        if self._was_armed and not pilot.armed:
+            self.write_report()
+        self._was_armed = pilot.armed
+
+    def write_report(self) -> None:
+        """Write the report file, if one was asked for; a file that cannot be written is said, not fatal."""
+        if self.config.report is None:
+            return
+        elapsed_s = max(time.monotonic() - self._started_s, 1e-9)
+        factor = round(self.vehicle.time_s / elapsed_s, 4)
+        content = self.recorder.as_dict(real_time_factor=factor, dropped_s=round(self.dropped_s, 3))
+        try:
+            write_json_atomically(self.config.report, content)
+        except OSError as error:
+            _log.error("the report %s cannot be written: %s", self.config.report, error.strerror)
+
+    def _facts(self) -> dict[str, Any]:
+        world, config = self.world, self.config
+        return {
+            "world": world.name,
+            "world_seed": world.seed,
+            "seed": config.seed,
+            "dynamics": "internal",
+            "estimate": config.estimate,
+            "wind_m_s": list(config.wind_m_s),
+            "size_m": [world.length_m, world.width_m, world.height_m],
+            "start": list(world.start),
+            "start_yaw_rad": world.start_yaw_rad,
+            "goal": list(world.goal),
+            "boxes": world.static_boxes.tolist(),
+            "movers": [
+                {
+                    "size_m": list(mover.size_m),
+                    "x_m": mover.x_m,
+                    "z_m": mover.z_m,
+                    "y_m": [mover.y_low_m, mover.y_high_m],
+                    "speed_m_s": mover.speed_m_s,
+                    "phase_m": mover.phase_m,
+                }
+                for mover in world.movers
+            ],
+        }
