@@ -4,7 +4,7 @@ Method: slab test of a ray against an axis-aligned box (Kay and Kajiya 1986), bo
 one, over the beams, has no branch and vectorises; boxes wholly out of range are skipped. Beams lie in the body's x-y plane;
 `rotation` turns body into world, so tilt is taken into account. All arithmetic in float64.
 
-A beam that starts inside a box reads 0. A beam that grazes a face counts as a hit (boxes are closed).
+A beam that starts inside a box reads 0. A beam that runs within a face counts as a hit: boxes are taken 1 nm larger.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 
 # Components smaller than this are replaced by it: no division by zero, and a slab missed by more than 1e-11 m stays missed.
 _SMALLEST = 1e-12
+_TOUCH_M = 1e-9  # so that a beam exactly within a face, of either side, has an extent to hit
 
 
 def beam_table(bearings_rad: Array) -> Array:
@@ -66,9 +67,9 @@ def cast_beams(boxes: Array, count: int, origin: Array, rotation: Array, beams: 
     for i in range(count):
         if _squared_distance(boxes[i], origin) > range_max_m * range_max_m:
             continue
-        x0, x1 = boxes[i, 0] - origin[0], boxes[i, 3] - origin[0]
-        y0, y1 = boxes[i, 1] - origin[1], boxes[i, 4] - origin[1]
-        z0, z1 = boxes[i, 2] - origin[2], boxes[i, 5] - origin[2]
+        x0, x1 = boxes[i, 0] - origin[0] - _TOUCH_M, boxes[i, 3] - origin[0] + _TOUCH_M
+        y0, y1 = boxes[i, 1] - origin[1] - _TOUCH_M, boxes[i, 4] - origin[1] + _TOUCH_M
+        z0, z1 = boxes[i, 2] - origin[2] - _TOUCH_M, boxes[i, 5] - origin[2] + _TOUCH_M
         for k in range(n_beams):
             xa, xb = x0 * inv_x[k], x1 * inv_x[k]
             ya, yb = y0 * inv_y[k], y1 * inv_y[k]
@@ -102,11 +103,12 @@ def cast_rays(boxes: Array, origin: Array, rotation: Array, bearings_rad: Array,
 def cast_rays_numpy(boxes: Array, origin: Array, rotation: Array, bearings_rad: Array, range_max_m: float) -> Array:
     """The readable twin of `cast_rays`: all boxes times all beams at once, parallel rays handled as their own case."""
     origin = np.asarray(origin, dtype=np.float64)
-    directions = (np.asarray(rotation, dtype=np.float64)[:, :2] @ beam_table(bearings_rad)).T  # [k, 3]
+    turn, (ahead, left) = np.asarray(rotation, dtype=np.float64), beam_table(bearings_rad)
+    directions = np.outer(ahead, turn[:, 0]) + np.outer(left, turn[:, 1])  # [k, 3]
     parallel = np.abs(directions) < _SMALLEST
     inverse = 1.0 / np.where(parallel, 1.0, directions)
     rows = np.asarray(boxes, dtype=np.float64).reshape(-1, 1, 6)
-    low, high = rows[..., :3] - origin, rows[..., 3:] - origin  # [m, 1, 3]
+    low, high = rows[..., :3] - origin - _TOUCH_M, rows[..., 3:] - origin + _TOUCH_M  # [m, 1, 3]
     between = (low <= 0.0) & (high >= 0.0)
     first, second = low * inverse, high * inverse
     near = np.where(parallel, np.where(between, -np.inf, np.inf), np.minimum(first, second)).max(axis=2)
