@@ -7,6 +7,7 @@ import logging
 import math
 import os
 import signal
+import stat
 import sys
 import threading
 from enum import StrEnum
@@ -125,7 +126,7 @@ def _serve(world: World, config: GatewayConfig, quit_with_parent: bool) -> None:
 
 
 def _follow_parent(stop: threading.Event) -> None:
-    """Set `stop` when stdin ends or this process gets another parent.
+    """Set `stop` when stdin, if it is a pipe, ends or this process gets another parent.
 
     Not by Linux's parent-death signal: that one comes already when the thread that started this process ends.
     """
@@ -141,7 +142,8 @@ def _follow_parent(stop: threading.Event) -> None:
             if os.getppid() != parent:
                 stop.set()
 
-    for watcher in (read_to_end, watch_parent):
+    piped = stat.S_ISFIFO(os.fstat(0).st_mode) or stat.S_ISSOCK(os.fstat(0).st_mode)
+    for watcher in (read_to_end, watch_parent) if piped else (watch_parent,):
         threading.Thread(target=watcher, daemon=True).start()
 
 

@@ -148,10 +148,10 @@ class Telemetry:
     def _extended_sys_state(self, _: Snapshot) -> Message:
         return mav.MAVLink_extended_sys_state_message(mav.MAV_VTOL_STATE_UNDEFINED, int(self._autopilot.landed_state))
 
-    def _sys_status(self, now: Snapshot) -> Message:
+    def _sys_status(self, _: Snapshot) -> Message:
         present = _SENSORS | _CONTROLS | _GPS | _AHRS | _BATTERY | _PREARM
         health = _SENSORS | _CONTROLS | _BATTERY
-        health |= _GPS | _AHRS if now.time_s >= POSITION_FLAG_FROM_S else 0
+        health |= _GPS | _AHRS if self._autopilot.healthy else 0
         health |= _PREARM if self._autopilot.can_arm or self._autopilot.armed else 0
         return mav.MAVLink_sys_status_message(present, present, health, 300, 16200, 0, 100, 0, 0, 0, 0, 0, 0)
 
