@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Bearing = Annotated[float, Field(ge=-180.0, le=180.0)]
 
@@ -34,13 +34,11 @@ class LidarSource(BaseModel):
     reconnect_min_s: float = Field(default=0.05, gt=0.0, le=10.0, description="first pause before a new connection")
     reconnect_max_s: float = Field(default=1.0, gt=0.0, le=60.0, description="longest pause: each failure doubles it")
 
-    @field_validator("reconnect_max_s")
-    @classmethod
-    def _ordered(cls, value: float, info: object) -> float:
-        minimum = getattr(info, "data", {}).get("reconnect_min_s", 0.0)
-        if value < minimum:
-            raise ValueError(f"must be at least reconnect_min_s ({minimum})")
-        return value
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.reconnect_max_s < self.reconnect_min_s:
+            raise ValueError(f"reconnect_max_s must be at least reconnect_min_s ({self.reconnect_min_s:g})")
+        return self
 
     @property
     def mount_yaw_rad(self) -> float:
