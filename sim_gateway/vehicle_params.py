@@ -7,7 +7,7 @@ compiled into `sim_gateway.vehicle`; after changing their order, delete that mod
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +25,15 @@ GRAVITY_M_S2 = 9.80665
 ) = range(38)  # fmt: skip
 PARAM_SIZE = 38
 
-# what `randomised` spreads; the rest are limits and filters of the autopilot, known exactly
-_SPREAD_FIELDS = (
+# What `randomised` spreads: the vehicle fully, the autopilot's gains by half (they are tuned to the vehicle, roughly).
+# The rest are limits and filters of the autopilot, known exactly.
+_VEHICLE_SPREAD = (
     "mass_kg", "inertia_xx_kg_m2", "inertia_yy_kg_m2", "inertia_zz_kg_m2", "motor_thrust_max_n", "yaw_moment_m", "motor_lag_s",
-    "drag_linear_n_s_m", "drag_quadratic_n_s2_m2", "velocity_p_xy", "velocity_i_xy", "velocity_d_xy", "velocity_p_z",
-    "velocity_i_z", "attitude_p_roll", "attitude_p_pitch", "rate_p_xy", "rate_p_yaw",
+    "drag_linear_n_s_m", "drag_quadratic_n_s2_m2",
+)  # fmt: skip
+_GAIN_SPREAD = (
+    "velocity_p_xy", "velocity_i_xy", "velocity_d_xy", "velocity_p_z", "velocity_i_z",
+    "attitude_p_roll", "attitude_p_pitch", "rate_p_xy", "rate_p_yaw",
 )  # fmt: skip
 
 
@@ -82,7 +86,7 @@ class VehicleParams:
     angular_acceleration_cutoff_hz: float = 30.0  # IMU_DGYRO_CUTOFF
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
+        for name, value in self._values().items():
             if not math.isfinite(value) or value < 0.0:
                 raise ValueError(f"vehicle parameter {name} is {value}: it must be finite and not negative")
         for name in ("mass_kg", "inertia_xx_kg_m2", "inertia_yy_kg_m2", "inertia_zz_kg_m2", "motor_thrust_max_n", "motor_lag_s"):
@@ -93,6 +97,9 @@ class VehicleParams:
         if self.tilt_max_rad >= math.radians(89.0):
             raise ValueError(f"vehicle parameter tilt_max_rad is {self.tilt_max_rad}: it must be below 89 degrees")
 
+    def _values(self) -> dict[str, float]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
     @property
     def hover_thrust(self) -> float:
         """Normalised collective thrust that carries the weight."""
@@ -100,24 +107,26 @@ class VehicleParams:
 
     def as_array(self) -> NDArray[np.float64]:
         """The row the kernels read: float64 [PARAM_SIZE], indexed by the constants of this module."""
-        values = asdict(self)
+        values = self._values()
         values["tilt_max_rad"] = math.tan(self.tilt_max_rad)
         values["hover_thrust_factor"] = self.hover_thrust * self.hover_thrust_factor
         return np.array(list(values.values()), dtype=np.float64)
 
     def randomised(self, rng: np.random.Generator, spread: float) -> VehicleParams:
-        """A vehicle whose masses, motors, drag and gains are each off by a uniform factor within 1 +- `spread`.
+        """A vehicle that is off by uniform factors: masses, motors and drag within 1 +- `spread`, gains within half of it.
 
-        The autopilot's hover thrust is off by a quarter of that, since PX4 estimates it in flight. `spread` in [0, 0.5].
+        The autopilot's hover thrust is off by a quarter, since PX4 estimates it in flight. `spread` in [0, 0.3]: beyond
+        that, stiff gains on slow motors make the attitude loop oscillate.
         """
-        if not 0.0 <= spread <= 0.5:
-            raise ValueError(f"spread is {spread}: it must lie in [0, 0.5]")
-        factors = rng.uniform(1.0 - spread, 1.0 + spread, len(_SPREAD_FIELDS))
-        changed = {name: getattr(self, name) * float(factor) for name, factor in zip(_SPREAD_FIELDS, factors, strict=True)}
-        hover_factor = self.hover_thrust_factor * float(rng.uniform(1.0 - 0.25 * spread, 1.0 + 0.25 * spread))
+        if not 0.0 <= spread <= 0.3:
+            raise ValueError(f"spread is {spread}: it must lie in [0, 0.3]")
+        names = _VEHICLE_SPREAD + _GAIN_SPREAD + ("hover_thrust_factor",)
+        widths = np.repeat([1.0, 0.5, 0.25], [len(_VEHICLE_SPREAD), len(_GAIN_SPREAD), 1]) * spread
+        factors = 1.0 + widths * rng.uniform(-1.0, 1.0, len(names))
+        changed = {name: getattr(self, name) * float(factor) for name, factor in zip(names, factors, strict=True)}
         thrust_floor = 1.4 * changed["mass_kg"] * GRAVITY_M_S2 / 4.0  # heavy with weak motors must still fly
         changed["motor_thrust_max_n"] = max(changed["motor_thrust_max_n"], thrust_floor)
-        return replace(self, hover_thrust_factor=hover_factor, **changed)
+        return replace(self, **changed)
 
 
 IRIS = VehicleParams()
