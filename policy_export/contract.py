@@ -168,7 +168,10 @@ class TrainingRecord(_Model):
 
 
 class VerificationRecord(_Model):
-    """How closely the file's graph follows the trained network, measured before the file was written."""
+    """How closely the file's graph follows the trained network, measured before the file was written.
+
+    `max_action_difference`: m/s or rad/s. `max_abs_difference`: over action, h, c and value (docs/policy_file.md says how).
+    """
 
     steps: int = Field(gt=0)
     resets: int = Field(ge=0)
@@ -177,6 +180,7 @@ class VerificationRecord(_Model):
     reference: str = Field(max_length=100)
     runtime: str = Field(max_length=100)
     tolerance: float = Field(gt=0.0)
+    max_action_difference: float = Field(ge=0.0)
     max_abs_difference: float = Field(ge=0.0)
 
     @model_validator(mode="after")

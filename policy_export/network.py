@@ -20,11 +20,12 @@ State = tuple[Tensor, Tensor]
 OWN_MOTION_SIZE = 10
 """Channels after the LiDAR: goal vector 3, velocity 3, acceleration 3, yaw 1."""
 
-_SHARP_LENGTH_M = 0.4
-_POSITION_SCALE_M = 35.0
-_VELOCITY_SCALE_M_S = 1.0
-_ACCELERATION_SCALE_M_S2 = 3.0
-_DIRECTION_SOFTENING_M = 0.1
+SHARP_LENGTH_M = 0.4
+POSITION_SCALE_M = 35.0
+VELOCITY_SCALE_M_S = 1.0
+ACCELERATION_SCALE_M_S2 = 3.0
+MOTION_LIMIT = 5.0
+DIRECTION_SOFTENING_M = 0.1
 """Keeps the direction to the goal smooth where the distance goes to zero."""
 
 
@@ -135,17 +136,17 @@ class PolicyNetwork(nn.Module):
         ranges = obs[..., :beams].clamp(0.0, self.config.range_max_m)
         goal, velocity, acceleration = (obs[..., beams + 3 * k : beams + 3 * k + 3] for k in range(3))
         yaw = obs[..., beams + 9 : beams + 10]
-        velocity = (velocity / _VELOCITY_SCALE_M_S).clamp(-5.0, 5.0)
-        acceleration = (acceleration / _ACCELERATION_SCALE_M_S2).clamp(-5.0, 5.0)
+        velocity = (velocity / VELOCITY_SCALE_M_S).clamp(-MOTION_LIMIT, MOTION_LIMIT)
+        acceleration = (acceleration / ACCELERATION_SCALE_M_S2).clamp(-MOTION_LIMIT, MOTION_LIMIT)
         if self.config.preprocessing == "channels":
-            scaled = (ranges / self.config.range_max_m, goal / _POSITION_SCALE_M, velocity, acceleration, yaw / math.pi)
+            scaled = (ranges / self.config.range_max_m, goal / POSITION_SCALE_M, velocity, acceleration, yaw / math.pi)
             return torch.cat(scaled, dim=-1)
         group = self.config.beam_group
         nearest = ranges.reshape(*ranges.shape[:-1], beams // group, group).amin(dim=-1)
-        sharp = torch.exp((self.config.vehicle_radius_m - nearest) / _SHARP_LENGTH_M)
+        sharp = torch.exp((self.config.vehicle_radius_m - nearest) / SHARP_LENGTH_M)
         distance = goal.square().sum(dim=-1, keepdim=True).sqrt()
-        direction = goal / (distance + _DIRECTION_SOFTENING_M)
-        squashed = (torch.log1p(distance) / math.log1p(_POSITION_SCALE_M), distance / (distance + 1.0))
+        direction = goal / (distance + DIRECTION_SOFTENING_M)
+        squashed = (torch.log1p(distance) / math.log1p(POSITION_SCALE_M), distance / (distance + 1.0))
         turn = (torch.sin(yaw), torch.cos(yaw))
         return torch.cat((nearest / self.config.range_max_m, sharp, direction, *squashed, velocity, acceleration, *turn), dim=-1)
 
