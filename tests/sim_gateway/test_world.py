@@ -39,6 +39,12 @@ def test_the_shipped_corridor_file_spells_out_the_defaults():
     assert world.static_boxes.tobytes() == generate_corridor(1).static_boxes.tobytes()
 
 
+def test_the_shipped_moving_corridor_moves():
+    world = load_world(WORLDS / "corridor_moving.yaml")
+    assert 1 <= len(world.movers) <= 4
+    assert not np.array_equal(world.boxes_at(0.0), world.boxes_at(1.0))
+
+
 def test_a_seed_argument_replaces_the_one_in_the_file():
     world = load_world(WORLDS / "corridor.yaml", seed=7)
     assert world.seed == 7
