@@ -53,8 +53,8 @@ class SafetyConfig(_Frozen):
 
     tick_s: Positive = Field(0.05, description="A3: time between two calls")
     dead_time_s: NotNegative = Field(0.2, description="A3: from sending a command until the vehicle begins to follow it")
-    lag_s: Positive = Field(0.7, description="A3: slowest first-order lag of the velocity loop (used to brake)")
-    lag_min_s: Positive = Field(0.4, description="A2: fastest lag of the velocity loop (used to speed up)")
+    lag_s: Positive = Field(0.6, description="A3: slowest first-order lag of the velocity loop (used to brake)")
+    lag_min_s: Positive = Field(0.35, description="A2: fastest lag of the velocity loop (used to speed up)")
     braking_m_s2: Positive = Field(2.0, description="A1: deceleration that is always available")
     position_error_m: NotNegative = Field(0.05, description="A4: bound of the position error, per axis")
     velocity_error_m_s: NotNegative = Field(0.05, description="A4: bound of the velocity error, per axis")

@@ -2,7 +2,8 @@
 
 A command passes when its brake tube (safety.braking) is nowhere nearer to a known obstacle, and nowhere further out of the eroded
 fence, than allowed. Allowed is the keep-out distance, or, where even braking cannot hold it (bad start, drift, an obstacle that
-appears), whatever braking reaches: a violation may not grow, and every way out of it stays open.
+appears), what braking reaches, judged point by point: no violation may grow, and every way out of it stays open. So that a
+vehicle just inside the margin can slide along a wall, points that braking keeps clear of may be neared to half the margin then.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ Floats = NDArray[np.float64]
 EPSILON_M = 1e-9  # rounding of one tube check
 SCALES = (0.8, 0.6, 0.4, 0.2, 0.1, 0.05)
 TURNS_RAD = tuple(math.radians(angle) for angle in (15.0, 30.0, 45.0, 60.0, 75.0, 85.0))
-OUTWARD = (0.0, 0.1)
+OUTWARD = (0.0, 0.1)  # slid candidates: this share of the wanted speed away from the obstacle
+SLIDE_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,15 +132,24 @@ class Shield:
         """Judge the wanted command (row 0) against the allowance that braking (row 1) sets."""
         tube = tubes(around.start, first, self._config)
         clear, fence = self._tube_clearances(tube, around), self._tube_fence(tube)
-        allowed = _Allowed(min(0.0, float(clear[1])), np.minimum(0.0, fence[1]), tube.stop_m[:, 1])
-        obstacle_ok = float(clear[0]) >= allowed.clearance_m - EPSILON_M
+        allowed = _Allowed(self._allowed_clearances(clear[1]), np.minimum(0.0, fence[1]), tube.stop_m[:, 1])
+        short = clear[0] - allowed.clearance_m
+        worst = int(np.argmin(short)) if short.shape[0] else -1
+        obstacle_ok = worst < 0 or float(short[worst]) >= -EPSILON_M
         face = int(np.argmin(fence[0] - allowed.fence_m))
         fence_ok = float(fence[0, face]) >= float(allowed.fence_m[face]) - EPSILON_M
         if not fence_ok:
             found.append(Intervention("fence", float(fence[0, face]), float(allowed.fence_m[face])))
         if not obstacle_ok:
-            found.append(Intervention("obstacle", float(clear[0]), allowed.clearance_m))
+            found.append(Intervention("obstacle", float(clear[0, worst]), float(allowed.clearance_m[worst])))
         return obstacle_ok and fence_ok, allowed
+
+    def _allowed_clearances(self, brake_m: Floats) -> Floats:
+        """How near each point [k] may come, given how near braking comes to it: 0 unless braking itself goes below."""
+        if brake_m.shape[0] == 0:
+            return brake_m
+        slide = max(min(0.0, float(brake_m.min())), -SLIDE_SHARE * self._config.margin_m)
+        return np.minimum(brake_m, slide)
 
     def _nearest(
         self, wanted: Floats, around: Surroundings, allowed: _Allowed, clearance_m: float, fence_margin_m: float
@@ -148,7 +159,8 @@ class Shield:
         candidates = self._view_capped(candidates, around, clearance_m, fence_margin_m, [])
         tube = tubes(around.start, candidates, self._config)
         fence_ok = (self._tube_fence(tube) >= allowed.fence_m - EPSILON_M).all(axis=1)
-        passed = fence_ok & (self._tube_clearances(tube, around) >= allowed.clearance_m - EPSILON_M)
+        clear_ok = (self._tube_clearances(tube, around) >= allowed.clearance_m - EPSILON_M).all(axis=1)
+        passed: NDArray[np.bool_] = np.logical_and(fence_ok, clear_ok)
         away = candidates - wanted
         cost = np.where(passed, np.einsum("ci,ci->c", away, away), math.inf)
         best = int(np.argmin(cost))
@@ -185,10 +197,7 @@ class Shield:
         return np.concatenate(((corners - self._low).min(axis=0), (self._high - corners).min(axis=0)), axis=1)
 
     def _tube_clearances(self, tube: Tubes, around: Surroundings) -> Floats:
-        """Smallest distance beyond keep-out between each tube [c] and all known points, m; inf without points."""
-        count = tube.stop_m.shape[1]
-        if around.x_m.shape[0] == 0:
-            return np.full(count, math.inf)
+        """Smallest distance beyond keep-out between each tube and each known point, [c, k], m."""
         config, error = self._config, self._config.velocity_error_m_s
         # the way from begin to turn is one tick long: begin is past choosing, turn is judged as the leg's begin
         turned = error * (config.dead_time_s + config.tick_s)
@@ -198,15 +207,15 @@ class Shield:
 
 @dataclass(frozen=True, slots=True)
 class _Allowed:
-    """How far a tube may violate clearance (<= 0) and fence faces [6] (<= 0); where braking ends [2 models, 3]."""
+    """How far a tube may violate clearance to each point [k] (<= 0) and fence faces [6] (<= 0); brake's stop [2 models, 3]."""
 
-    clearance_m: float
+    clearance_m: Floats
     fence_m: Floats
     stop_m: Floats
 
 
 def _leg_clearances(begin_m: Floats, end_m: Floats, error_begin_m: float, error_end_m: float, around: Surroundings) -> Floats:
-    """Smallest distance from straight legs [2 models, c, 3] to the points, less errors that grow along the leg, [c], m."""
+    """Smallest distance from straight legs [2 models, c, 3] to the points, less errors that grow along the leg, [c, k], m."""
     ax, ay = begin_m[..., 0].reshape(-1, 1), begin_m[..., 1].reshape(-1, 1)
     dx, dy = end_m[..., 0].reshape(-1, 1) - ax, end_m[..., 1].reshape(-1, 1) - ay
     rx, ry = around.x_m - ax, around.y_m - ay
@@ -218,9 +227,9 @@ def _leg_clearances(begin_m: Floats, end_m: Floats, error_begin_m: float, error_
     distance -= around.extra_m
     along *= error_end_m - error_begin_m
     distance -= along
-    nearest: Floats = distance.min(axis=1) - error_begin_m
-    worst: Floats = nearest.reshape(2, -1).min(axis=0)
-    return worst
+    slow, fast = distance.reshape(*begin_m.shape[:2], around.x_m.shape[0])
+    nearest: Floats = np.minimum(slow, fast) - error_begin_m
+    return nearest
 
 
 def _vector(values: Floats) -> CorridorVector:
