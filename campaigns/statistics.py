@@ -38,7 +38,7 @@ class EpisodeResult:
         return min(1.0, self.shortest_path_m / self.path_length_m) if self.path_length_m > 0.0 else 0.0
 
 
-FAILURES = ("hit_static", "hit_moving", "wall", "fence", "timeout", "safety_stop")
+FAILURES = ("hit_static", "hit_moving", "wall", "fence", "timeout", "missed_goal")
 
 
 def wilson_interval(successes: int, n: int, z: float = Z_95) -> tuple[float, float]:
