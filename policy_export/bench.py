@@ -31,8 +31,10 @@ def interleaved_us(steps_by_name: dict[str, Callable[[], object]], steps: int) -
     for call in steps_by_name.values():
         for _ in range(_BLOCK):
             call()
-    for _ in range(max(1, steps // _BLOCK)):
-        for name, call in steps_by_name.items():
+    order = list(steps_by_name.items())
+    for turn in range(max(1, steps // _BLOCK)):
+        # Each starts the round in its turn: whoever follows a heavy candidate finds cold caches.
+        for name, call in order[turn % len(order) :] + order[: turn % len(order)]:
             for _ in range(_BLOCK):
                 begin = time.perf_counter_ns()
                 call()
