@@ -1,0 +1,93 @@
+"""The `fly` command."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flight.errors import ExitCode, FlyError, MissionError
+
+_EPILOG = """
+Examples:
+
+fly --mission configs/corridor.yaml
+
+fly --mission configs/corridor.yaml --seed 17 --out runs/seed17 --json
+
+Exit codes: 0 goal reached and landed, 1 ended safely without reaching the goal, 2 usage or configuration,
+3 preflight refused (nothing armed), 4 safety ended the flight. Ctrl-C brakes, holds and lands.
+"""
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+@app.callback(invoke_without_command=True, epilog=_EPILOG)
+def fly(
+    mission: Annotated[Path, typer.Option(help="Mission file (YAML), see docs/mission.md.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default runs/<time>-<name>.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Replaces sim.seed: another corridor.")] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print summary.json on stdout; everything else goes to stderr.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before arming a real vehicle.")] = False,
+) -> None:
+    """Check, arm, take off, fly the policy to the goal in OFFBOARD, land, and write one folder of results."""
+    raise typer.Exit(_fly(mission, out, seed, as_json, yes))
+
+
+def _fly(mission_path: Path, out: Path | None, seed: int | None, as_json: bool, yes: bool) -> int:
+    from flight.interrupt import Interrupt, Interrupted
+    from flight.mission import load_mission
+    from flight.results import make_run_folder, remove_if_empty
+    from flight.session import FlightSession
+    from flight.status import Status
+
+    mission = load_mission(mission_path, seed)
+    if not mission.simulated:
+        _confirm(mission.vehicle.connection, yes)
+    folder = make_run_folder(out, mission.name)
+    with Status(machine_output=as_json) as status, Interrupt(lambda name: status.phase(f"{name}: stopping")) as interrupt:
+        try:
+            result = FlightSession(mission, folder, status, interrupt).run()
+        except Interrupted:
+            print(f"fly: stopped by {interrupt.name} before arming", file=sys.stderr)
+            return ExitCode.NOT_REACHED
+        finally:
+            remove_if_empty(folder)
+        status.phase(f"{result.outcome}: {result.message}; results in {result.folder}")
+    if as_json:
+        print(json.dumps(json.loads((result.folder / "summary.json").read_text(encoding="utf-8"))))
+    return result.exit_code
+
+
+def _confirm(connection: str, yes: bool) -> None:
+    """A real vehicle is armed only after a yes. Raises `MissionError` where nobody can be asked."""
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise MissionError(f"about to arm a real vehicle on {connection}: add --yes to fly without being asked")
+    if not typer.confirm(f"Arm the vehicle on {connection} and take off?", default=False, err=True):
+        raise MissionError("not flown: the answer was no")
+
+
+def main() -> None:
+    """Entry point: errors are one line on stderr, without a traceback."""
+    logging.basicConfig(level=logging.WARNING, format="fly: %(message)s", stream=sys.stderr)
+    try:
+        code = app(standalone_mode=False)
+    except FlyError as error:
+        print(f"fly: {error}", file=sys.stderr)
+        code = error.exit_code
+    except typer.Abort:
+        code = ExitCode.NOT_REACHED
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # typer's usage errors have no public base class
+            raise
+        print(f"fly: {error.format_message()} See fly --help.", file=sys.stderr)
+        code = ExitCode.USAGE
+    sys.exit(int(code or 0))

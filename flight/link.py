@@ -1,0 +1,345 @@
+"""The vehicle over MAVSDK: telemetry in, one-shot velocity setpoints and commands with deadlines out.
+
+Setpoints go out as single SET_POSITION_TARGET_LOCAL_NED messages through MAVSDK's direct-message plugin. MAVSDK's
+Offboard plugin is never used: it repeats the last setpoint by itself for ever, so a hung program would fly on and PX4's
+own offboard-loss action would never come. Here, when the program stops, the stream stops.
+
+Everything MAVSDK calls back arrives on its own thread and only replaces the newest sample (`flight.telemetry`).
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import socket
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+from urllib.parse import urlsplit
+
+from flight.errors import MissionError, NoVehicleError, RefusedError, VehicleCommandError
+from flight.px4 import (
+    AUTOPILOT_COMPONENT,
+    AUTOPILOT_PX4,
+    COMMAND_DO_SET_MODE,
+    COMMAND_SET_MESSAGE_INTERVAL,
+    FRAME_LOCAL_NED,
+    MESSAGE_ID,
+    MODE_FLAG_CUSTOM,
+    RESULT_ACCEPTED,
+    RESULT_NAMES,
+    TYPE_MASK_VELOCITY_YAW_RATE,
+    FlightMode,
+    mode_name,
+)
+from flight.telemetry import MESSAGES, Telemetry
+from safety.frames import CorridorFrame
+from safety.messages import SafeCommand, VehicleState
+
+log = logging.getLogger("fly.link")
+
+COMMAND_DEADLINE_S = 3.0
+MODE_DEADLINE_S = 3.0
+POLL_S = 0.01
+OWN_SYSTEM_ID = 245
+OWN_COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
+LOOPBACK_HOSTS = ("127.0.0.1", "localhost", "::1")
+
+
+class VehicleLink:
+    """One PX4 vehicle. `connect`, then read `state`, `mode`, `armed`; command with `arm`, `set_mode`, `send_velocity`, ...
+
+    `url` is MAVSDK's (`udpin://127.0.0.1:14540`, `udpout://...`, `tcpout://...`, `serial:///dev/ttyAMA0:921600`).
+    Every command has a deadline and raises `VehicleCommandError` with the vehicle's own words. `keep_alive`, where a
+    method takes it, is called at least every 20 ms while waiting, so that a setpoint stream can go on meanwhile.
+    """
+
+    def __init__(self, url: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self.url = url
+        self.telemetry = Telemetry()
+        self.system_id = 0
+        self.setpoints_sent = 0
+        self._clock = clock
+        self._mavsdk: Any = None
+        self._direct: Any = None
+        self._action: Any = None
+        self._param: Any = None
+        self._target = (0, 0)
+        self._message: Any = None
+
+    def __enter__(self) -> VehicleLink:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    # -- connection ---------------------------------------------------------------------------------------------
+
+    def connect(self, timeout_s: float = 10.0, keep_waiting: Callable[[], None] | None = None) -> None:
+        """Wait for a PX4 autopilot's heartbeat. Raises `NoVehicleError` after `timeout_s`, `RefusedError` on a busy port."""
+        from mavsdk import Configuration, ConnectionResult, Mavsdk  # noqa: PLC0415  (loads a 30 MB library)
+
+        check_port_is_free(self.url)
+        _route_mavsdk_log()
+        deadline = self._clock() + timeout_s
+        configuration = Configuration.create_manual(OWN_SYSTEM_ID, OWN_COMPONENT_ID, True)
+        self._mavsdk = Mavsdk(configuration)
+        result = self._mavsdk.add_any_connection(self.url)
+        if result != ConnectionResult.SUCCESS:
+            raise _connection_error(self.url, result.name)
+        system = self._wait_for_autopilot(deadline, keep_waiting)
+        if system is None:
+            raise NoVehicleError(
+                f"no vehicle answering on {self.url} within {timeout_s:g} s: check that it is powered, that its MAVLink "
+                "output goes to this port, and `vehicle.connection` in the mission"
+            )
+        self._open_plugins(system)
+        self._wait_for_heartbeat(deadline + 2.0, keep_waiting)
+
+    def _wait_for_autopilot(self, deadline: float, keep_waiting: Callable[[], None] | None) -> Any:
+        while self._clock() < deadline:
+            if keep_waiting is not None:
+                keep_waiting()
+            system = self._mavsdk.first_autopilot(0.1)
+            if system is not None:
+                return system
+        return None
+
+    def _open_plugins(self, system: Any) -> None:
+        from mavsdk.plugins.action import Action  # noqa: PLC0415
+        from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage  # noqa: PLC0415
+        from mavsdk.plugins.param import Param  # noqa: PLC0415
+
+        self.system_id = int(system.get_system_id())
+        self._target = (self.system_id, AUTOPILOT_COMPONENT)
+        self._message = MavlinkMessage
+        self._direct, self._action, self._param = MavlinkDirect(system), Action(system), Param(system)
+        for name in MESSAGES:
+            self._direct.subscribe_message(name, self._on_message)
+
+    def _wait_for_heartbeat(self, deadline: float, keep_waiting: Callable[[], None] | None) -> None:
+        if not self.wait_until(lambda: self.telemetry.autopilot is not None, deadline - self._clock(), keep_waiting):
+            raise NoVehicleError(f"no heartbeat from an autopilot on {self.url}: check that system {self.system_id} runs PX4")
+        if self.telemetry.autopilot != AUTOPILOT_PX4:
+            raise RefusedError(
+                f"the autopilot on {self.url} is not PX4 (MAV_AUTOPILOT {self.telemetry.autopilot}); use PX4 v1.14 or later"
+            )
+
+    def close(self) -> None:
+        """Drop the connection. Idempotent. The vehicle then sees no setpoint and no heartbeat from us."""
+        mavsdk, self._mavsdk = self._mavsdk, None
+        self._direct = self._action = self._param = None
+        if mavsdk is not None:
+            mavsdk.destroy()
+
+    # -- telemetry ----------------------------------------------------------------------------------------------
+
+    def _on_message(self, message: Any, _user_data: Any) -> None:
+        if message.system_id == self.system_id:
+            self.telemetry.feed(message.message_name, message.component_id, message.fields_json, self._clock())
+
+    @property
+    def mode(self) -> int | None:
+        """The newest mode PX4 reported (`FlightMode` numbering), None before the first."""
+        return self.telemetry.mode
+
+    @property
+    def armed(self) -> bool:
+        """Armed, by the newest heartbeat (1 Hz)."""
+        return bool(self.telemetry.armed)
+
+    def state(self, frame: CorridorFrame) -> VehicleState | None:
+        """The newest estimate in the corridor frame; None before the first complete one."""
+        return self.telemetry.state(frame)
+
+    def request_stream_rates(self, rate_hz: float = 50.0) -> None:
+        """Ask for the messages the loop lives on at `rate_hz`. Raises `VehicleCommandError` when PX4 refuses."""
+        for name in ("LOCAL_POSITION_NED", "ATTITUDE", "HIGHRES_IMU"):
+            self.command_long(COMMAND_SET_MESSAGE_INTERVAL, MESSAGE_ID[name], 1e6 / rate_hz, what=f"the rate of {name}")
+
+    def wait_until(self, condition: Callable[[], bool], timeout_s: float, keep_alive: Callable[[], None] | None = None) -> bool:
+        """Poll `condition` every 10 ms until it holds (True) or `timeout_s` passed (False)."""
+        deadline = self._clock() + timeout_s
+        while not condition():
+            if self._clock() >= deadline:
+                return False
+            if keep_alive is not None:
+                keep_alive()
+            time.sleep(POLL_S)
+        return True
+
+    # -- setpoints ----------------------------------------------------------------------------------------------
+
+    def send_velocity(self, command: SafeCommand, frame: CorridorFrame) -> float:
+        """Send one velocity setpoint; returns the time of the send. The last gate before the wire: not finite is refused.
+
+        Raises `ValueError` on a number that is not finite, `VehicleCommandError` when the link cannot send.
+        """
+        velocity = frame.vector_to_ned(command.velocity)
+        yaw_rate = frame.yaw_rate_to_ned(command.yaw_rate_rad_s)
+        if not (math.isfinite(velocity.x + velocity.y + velocity.z) and math.isfinite(yaw_rate)):
+            raise ValueError(f"refusing to send a setpoint that is not finite: {command}")
+        fields = (
+            f'{{"time_boot_ms":{int(self._clock() * 1e3) & 0xFFFFFFFF},"target_system":{self._target[0]},'
+            f'"target_component":{self._target[1]},"coordinate_frame":{FRAME_LOCAL_NED},"type_mask":{TYPE_MASK_VELOCITY_YAW_RATE},'
+            f'"x":0,"y":0,"z":0,"vx":{velocity.x!r},"vy":{velocity.y!r},"vz":{velocity.z!r},'
+            f'"afx":0,"afy":0,"afz":0,"yaw":0,"yaw_rate":{yaw_rate!r}}}'
+        )
+        self._send("SET_POSITION_TARGET_LOCAL_NED", fields)
+        self.setpoints_sent += 1
+        return self._clock()
+
+    def _send(self, name: str, fields_json: str) -> None:
+        from mavsdk import MavsdkError  # noqa: PLC0415
+
+        try:
+            self._direct.send_message(self._message(name, 0, 0, *self._target, fields_json))
+        except (MavsdkError, RuntimeError) as error:
+            raise VehicleCommandError(f"cannot send {name} on {self.url}: {error}") from None
+
+    # -- commands -----------------------------------------------------------------------------------------------
+
+    def arm(self, keep_alive: Callable[[], None] | None = None) -> None:
+        """Arm, and wait until the heartbeat says so."""
+        self._act("arm", "arm", keep_alive)
+        if not self.wait_until(lambda: self.armed, 2.5, keep_alive):
+            raise VehicleCommandError("the vehicle accepted arming, but its heartbeat does not say armed")
+
+    def disarm(self) -> None:
+        """Disarm on the ground. PX4 refuses in the air."""
+        self._act("disarm", "disarm", None)
+
+    def take_off(self, height_m: float, keep_alive: Callable[[], None] | None = None) -> None:
+        """Set MIS_TAKEOFF_ALT and start PX4's own takeoff; returns when PX4 accepted it, not when the height is reached."""
+        self.set_parameter("MIS_TAKEOFF_ALT", float(height_m))
+        self._act("takeoff", "take off", keep_alive)
+
+    def set_mode(self, mode: FlightMode, keep_alive: Callable[[], None] | None = None) -> None:
+        """Command `mode` and wait until PX4 reports it. PX4's first ack of this command is always `accepted`: not believed."""
+        self.command_long(
+            COMMAND_DO_SET_MODE, MODE_FLAG_CUSTOM, mode.main, mode.sub, what=f"mode {mode.name}", keep_alive=keep_alive
+        )
+        if not self.wait_until(lambda: self.mode == mode, MODE_DEADLINE_S, keep_alive):
+            raise VehicleCommandError(f"PX4 did not enter {mode.name}: it stays in {mode_name(self.mode)}{self._last_words()}")
+
+    def command_long(self, command: int, *parameters: float, what: str, keep_alive: Callable[[], None] | None = None) -> None:
+        """Send COMMAND_LONG, wait for the final COMMAND_ACK; raises `VehicleCommandError` unless it is accepted."""
+        fields: dict[str, float] = {f"param{i + 1}": 0.0 for i in range(7)}
+        fields.update({f"param{i + 1}": float(value) for i, value in enumerate(parameters)})
+        fields |= {"target_system": self._target[0], "target_component": self._target[1], "command": command, "confirmation": 0}
+        answer = _Answer()
+        message = self._message("COMMAND_LONG", 0, 0, *self._target, json.dumps(fields))
+        self._direct.send_command_async(message, answer.on_ack)
+        if not self.wait_until(answer.done.is_set, COMMAND_DEADLINE_S, keep_alive):
+            raise VehicleCommandError(f"the vehicle did not answer the request for {what} within {COMMAND_DEADLINE_S:g} s")
+        if answer.result != RESULT_ACCEPTED:
+            raise VehicleCommandError(f"the vehicle refused {what}: {answer.text}{self._last_words()}")
+
+    def _act(self, method: str, what: str, keep_alive: Callable[[], None] | None) -> None:
+        answer = _Answer()
+        getattr(self._action, f"{method}_async")(answer.on_action)
+        if not self.wait_until(answer.done.is_set, COMMAND_DEADLINE_S, keep_alive):
+            raise VehicleCommandError(f"the vehicle did not answer the command to {what} within {COMMAND_DEADLINE_S:g} s")
+        if answer.result != RESULT_ACCEPTED:
+            raise VehicleCommandError(f"the vehicle refused to {what}: {answer.text}{self._last_words()}")
+
+    def _last_words(self) -> str:
+        recent = [item.text for item in self.telemetry.texts if item.severity <= 4 and self._clock() - item.time_s < 5.0]
+        return f' ("{recent[-1]}")' if recent else ""
+
+    # -- parameters ---------------------------------------------------------------------------------------------
+
+    def get_parameter(self, name: str, kind: type[int] | type[float]) -> int | float:
+        """Read a PX4 parameter. Raises `VehicleCommandError` when it does not exist or is of another type."""
+        from mavsdk import MavsdkError  # noqa: PLC0415
+
+        try:
+            return kind(self._param.get_param_int(name) if kind is int else self._param.get_param_float(name))
+        except MavsdkError as error:
+            raise VehicleCommandError(f"cannot read parameter {name} of the vehicle: {error}") from None
+
+    def set_parameter(self, name: str, value: int | float) -> None:
+        """Write a PX4 parameter and read it back. Raises `VehicleCommandError` when the vehicle holds another value."""
+        from mavsdk import MavsdkError  # noqa: PLC0415
+
+        try:
+            if isinstance(value, int):
+                self._param.set_param_int(name, value)
+            else:
+                self._param.set_param_float(name, value)
+        except MavsdkError as error:
+            raise VehicleCommandError(f"cannot set parameter {name} of the vehicle: {error}") from None
+        held = self.get_parameter(name, type(value))
+        if not math.isclose(held, value, rel_tol=1e-6):
+            raise VehicleCommandError(
+                f"parameter {name} reads back {held:g} after setting {value:g}; set it by hand in QGroundControl"
+            )
+
+
+class _Answer:
+    """The answer to one command, filled on MAVSDK's thread."""
+
+    def __init__(self) -> None:
+        self.done = threading.Event()
+        self.result = -1
+        self.text = "no answer"
+
+    def on_ack(self, result: Any, ack: Any, _user_data: Any) -> None:
+        """Final COMMAND_ACK of a direct command."""
+        if result.name == "SUCCESS":
+            self.result = int(json.loads(ack.fields_json).get("result", -1))
+            self.text = RESULT_NAMES.get(self.result, f"result {self.result}")
+        else:
+            self.text = str(result.name).lower().replace("_", " ")
+        self.done.set()
+
+    def on_action(self, result: Any, _user_data: Any) -> None:
+        """Result of an Action plugin call."""
+        self.result = RESULT_ACCEPTED if result.name == "SUCCESS" else -1
+        self.text = str(result.name).lower().replace("_", " ")
+        self.done.set()
+
+
+def check_port_is_free(url: str) -> None:
+    """For a listening UDP URL: bind its port once, so that a busy one is named before anything else starts."""
+    parts = urlsplit(url)
+    if parts.scheme not in ("udp", "udpin"):
+        return
+    host, port = parts.hostname or "0.0.0.0", parts.port or 0
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise RefusedError(
+                f"cannot listen on {url}: {error.strerror}; stop the program that uses UDP port {port} or change the "
+                "connection in the mission"
+            ) from None
+
+
+def _connection_error(url: str, result: str) -> Exception:
+    if result in ("BIND_ERROR", "SOCKET_ERROR"):
+        return RefusedError(f"cannot listen on {url}: {result}; is another program using this port?")
+    if result in ("CONNECTION_URL_INVALID", "BAUDRATE_UNKNOWN"):
+        return MissionError(f"vehicle.connection {url}: {result}; give for example udpin://127.0.0.1:14540")
+    return NoVehicleError(f"cannot open {url}: {result}; check cable, device name and permissions")
+
+
+_log_routed = False
+
+
+def _route_mavsdk_log() -> None:
+    """Send MAVSDK's own log to Python logging: its default writes to standard output, which belongs to `--json`."""
+    global _log_routed  # noqa: PLW0603  (MAVSDK's log has one subscriber per process)
+    if _log_routed:
+        return
+    from mavsdk import log_subscribe  # noqa: PLC0415
+
+    def forward(level: Any, message: str, _file: str | None, _line: int) -> bool:
+        log.log(10 * min(int(level) + 1, 4) if int(level) >= 2 else logging.DEBUG, "mavsdk: %s", message)
+        return True
+
+    log_subscribe(forward)
+    _log_routed = True

@@ -1,0 +1,212 @@
+"""The mission file: what to fly, where, within which limits. See docs/mission.md.
+
+`load_mission` reads YAML strictly (`strict_yaml`) and checks every value against the others, so that a contradiction is
+refused before anything is started. Paths in the file are relative to the file's own folder.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from flight.errors import MissionError
+from flight.lidar.config import LidarSource
+from flight.px4 import LossAction
+from safety.config import SafetyConfig
+from safety.frames import CorridorVector
+from strict_yaml import ConfigError, load_config
+
+SIM = "sim"
+Coordinate = Annotated[float, Field(ge=-10_000.0, le=10_000.0)]
+Seconds = Annotated[float, Field(gt=0.0, le=3600.0)]
+Port = Annotated[int, Field(ge=1, le=65535)]
+
+_URL = re.compile(r"(udpin|udpout|tcpin|tcpout)://[^\s:/]+:\d{1,5}$|serial(_flowcontrol)?:///[^\s:]+:\d{3,8}$")
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class VehicleSection(_Section):
+    """The vehicle. `connection`: `sim` starts sim-gateway; otherwise a MAVSDK URL, which is the only address used."""
+
+    connection: str = Field(default=SIM, max_length=200, description="sim, udpin://127.0.0.1:14540, serial:///dev/ttyAMA0:921600")
+    stream_rate_hz: float = Field(default=50.0, ge=20.0, le=200.0, description="rate asked for position, attitude and IMU")
+
+    @field_validator("connection")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value != SIM and not _URL.fullmatch(value):
+            raise ValueError("give `sim`, or a MAVSDK URL such as udpin://127.0.0.1:14540 or serial:///dev/ttyAMA0:921600")
+        return value
+
+
+class PolicySection(_Section):
+    """The policy file, and optionally the SHA-256 it must have."""
+
+    path: Path
+    sha256: str | None = Field(default=None, pattern=r"^[0-9a-fA-F]{64}$")
+
+
+class FrameSection(_Section):
+    """Where the corridor lies. It is anchored where the vehicle stands at arming.
+
+    `takeoff_point_m`: that spot's corridor x and y, `world` (sim) the world's own start. `heading_deg`: compass heading of
+    the corridor's x axis, clockwise from north; `vehicle` the way the vehicle's nose points at arming.
+    """
+
+    takeoff_point_m: tuple[Coordinate, Coordinate] | Literal["world"] = (0.0, 0.0)
+    heading_deg: Annotated[float, Field(ge=-360.0, le=360.0)] | Literal["vehicle"] = "vehicle"
+
+
+class GoalSection(_Section):
+    """Where to: corridor frame, m. `world` (sim) is the world's own goal."""
+
+    position_m: tuple[Coordinate, Coordinate, Coordinate] | Literal["world"]
+    radius_m: float = Field(default=0.3, ge=0.05, le=10.0, description="reached within this distance (3D)")
+
+
+class TimeoutSection(_Section):
+    """Deadlines, s. Every wait of `fly` has one."""
+
+    connect_s: Seconds = Field(default=10.0, description="for the vehicle's first heartbeat")
+    lidar_s: Seconds = Field(default=10.0, description="for the first scan")
+    gateway_s: Seconds = Field(default=300.0, description="for sim-gateway (its first start compiles for a minute)")
+    ready_s: Seconds = Field(default=30.0, description="for a position estimate and PX4's consent to arm")
+    takeoff_s: Seconds = Field(default=40.0, description="to reach the takeoff height")
+    flight_s: Seconds = Field(default=180.0, description="from OFFBOARD to the goal")
+    stuck_s: Seconds = Field(default=30.0, description="without coming 0.5 m nearer to the goal")
+    land_s: Seconds = Field(default=60.0, description="from the landing command to disarm")
+
+
+class FailsafeSection(_Section):
+    """What happens when something is wrong. Braking comes first always; these are the steps after it.
+
+    `setpoint_loss_*` are PX4's own reaction when the setpoint stream stops (COM_OF_LOSS_T, COM_OBL_RC_ACT): set and read
+    back before OFFBOARD.
+    """
+
+    hold_after_s: float = Field(
+        default=2.0, gt=0.0, le=10.0, description="braking without a cure for this long: PX4 Hold, then land"
+    )
+    stall_s: float = Field(default=0.15, gt=0.05, le=0.5, description="a loop this late brakes before it flies on")
+    setpoint_loss_timeout_s: float = Field(default=0.5, ge=0.3, le=2.0)
+    setpoint_loss_action: Literal["hold", "land"] = "hold"
+
+    @property
+    def loss_action(self) -> LossAction:
+        """Value of COM_OBL_RC_ACT."""
+        return LossAction[self.setpoint_loss_action.upper()]
+
+
+class SimSection(_Section):
+    """For `vehicle.connection: sim` only: what the gateway simulates."""
+
+    world: Path
+    seed: int = Field(default=0, ge=0, lt=2**63)
+    dynamics: Literal["internal"] = "internal"
+    estimate: Literal["none", "nominal", "px4_sih"] = Field(default="nominal", description="errors of the vehicle's own estimate")
+    wind_m_s: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
+    onboard_port: Port = 14540
+    gcs_port: Port = 14550
+
+    @field_validator("wind_m_s")
+    @classmethod
+    def _flyable(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if math.hypot(*value) > 15.0:
+            raise ValueError("more than 15 m/s of wind; no vehicle of this project flies in it")
+        return value
+
+
+class Mission(_Section):
+    """A whole mission, checked. Made by `load_mission`."""
+
+    name: str = Field(default="flight", pattern=r"^[A-Za-z0-9_-]{1,40}$", description="part of the run folder's name")
+    vehicle: VehicleSection = VehicleSection()
+    policy: PolicySection
+    frame: FrameSection = FrameSection()
+    takeoff_height_m: float = Field(gt=0.3, le=50.0)
+    goal: GoalSection
+    lidar: LidarSource = LidarSource()
+    safety: SafetyConfig
+    timeouts: TimeoutSection = TimeoutSection()
+    failsafe: FailsafeSection = FailsafeSection()
+    sim: SimSection | None = None
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the gateway is started for this mission."""
+        return self.vehicle.connection == SIM
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.simulated and self.sim is None:
+            raise ValueError("sim: this section is required with vehicle.connection: sim; add at least sim.world")
+        if not self.simulated and "world" in (self.goal.position_m, self.frame.takeoff_point_m):
+            raise ValueError("`world` positions need vehicle.connection: sim; give numbers")
+        if self.goal.position_m != "world":
+            _raise_first(goal_problem(CorridorVector(*self.goal.position_m), self.safety))
+        if self.frame.takeoff_point_m != "world":
+            _raise_first(takeoff_problem(self.frame.takeoff_point_m, self.takeoff_height_m, self.safety))
+        return self
+
+
+def goal_problem(goal: CorridorVector, safety: SafetyConfig) -> str | None:
+    """What is wrong with a goal, or None: it must lie in the eroded fence, or the safety filter would never let it be reached."""
+    low, high = safety.keep_in()
+    for axis, value, lowest, highest in zip("xyz", (goal.x, goal.y, goal.z), low, high, strict=True):
+        if not lowest <= value <= highest:
+            return (
+                f"goal.position_m {axis} = {value:g} m is outside the safe part of the fence, {lowest:.2f} .. {highest:.2f} m "
+                "(fence less vehicle, position error and margin); move the goal or widen safety.fence"
+            )
+    return None
+
+
+def takeoff_problem(point: tuple[float, float], height_m: float, safety: SafetyConfig) -> str | None:
+    """What is wrong with takeoff point and height, or None: the hover point must lie in the eroded fence."""
+    low, high = safety.keep_in()
+    for axis, value, lowest, highest in zip("xy", point, low, high, strict=False):
+        if not lowest <= value <= highest:
+            return (
+                f"frame.takeoff_point_m {axis} = {value:g} m is outside the safe part of the fence, {lowest:.2f} .. "
+                f"{highest:.2f} m; move it or widen safety.fence"
+            )
+    if not low[2] <= height_m <= high[2]:
+        return (
+            f"takeoff_height_m = {height_m:g} m is outside the safe part of the fence, {low[2]:.2f} .. {high[2]:.2f} m; "
+            "change it or safety.fence"
+        )
+    return None
+
+
+def load_mission(path: str | Path, seed: int | None = None) -> Mission:
+    """Read and check a mission. `seed` replaces `sim.seed`. Raises `MissionError`, one line per mistake (file:line: field)."""
+    file = Path(path)
+    try:
+        mission = load_config(file, Mission)
+    except ConfigError as error:
+        raise MissionError(str(error)) from None
+    updates: dict[str, object] = {"policy": mission.policy.model_copy(update={"path": _resolve(file, mission.policy.path)})}
+    if mission.sim is not None:
+        sim: dict[str, object] = {"world": _resolve(file, mission.sim.world)}
+        if seed is not None:
+            sim["seed"] = seed
+        updates["sim"] = mission.sim.model_copy(update=sim)
+    elif seed is not None:
+        raise MissionError(f"{file}: --seed needs a `sim` section; a real world has no seed")
+    return mission.model_copy(update=updates)
+
+
+def _resolve(mission_file: Path, path: Path) -> Path:
+    return path if path.is_absolute() else (mission_file.parent / path)
+
+
+def _raise_first(problem: str | None) -> None:
+    if problem is not None:
+        raise ValueError(problem)

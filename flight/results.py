@@ -1,0 +1,62 @@
+"""The run folder of one flight: `summary.json`, `trajectory.csv`, `trajectory.png`."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flight.errors import MissionError
+
+log = logging.getLogger("fly.results")
+
+
+def make_run_folder(wanted: Path | None, name: str) -> Path:
+    """The folder for this flight, new and writable: `wanted`, or `runs/<time>-<name>`. Raises `MissionError`."""
+    folder = wanted if wanted is not None else Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
+    try:
+        if wanted is None:
+            folder = _unused(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise MissionError(f"{folder} is not empty: give another folder with --out")
+        probe = folder / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise MissionError(f"cannot write to {folder}: {error.strerror}; give another folder with --out") from None
+    return folder
+
+
+def _unused(folder: Path) -> Path:
+    candidate, number = folder, 1
+    while candidate.exists():
+        number += 1
+        candidate = folder.with_name(f"{folder.name}-{number}")
+    return candidate
+
+
+def remove_if_empty(folder: Path) -> None:
+    """Leave no empty folder behind when nothing was flown."""
+    try:
+        folder.rmdir()
+    except OSError:
+        log.debug("%s is kept", folder)
+
+
+def truth_from_report(report: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """[n, 3] true positions of a gateway report, corridor frame, or None."""
+    trajectory = report.get("trajectory")
+    rows = trajectory.get("rows") if isinstance(trajectory, dict) else None
+    if not isinstance(rows, list) or not rows:
+        return None
+    try:
+        table = np.array(rows, dtype=np.float64)
+    except (ValueError, TypeError):
+        return None
+    return table[:, 1:4] if table.ndim == 2 and table.shape[1] >= 4 else None

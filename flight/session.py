@@ -1,0 +1,375 @@
+"""One flight from mission to results: start what is needed, check, arm, take off, fly the policy, land, write the folder.
+
+Order of care: nothing is armed before every check has passed; once armed, every way out goes through `Landing`, whatever
+happened; results are written last, so that no disk can delay a landing.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.errors import ExitCode, MissionError, RefusedError, VehicleCommandError
+from flight.gateway_process import GatewayProcess, GatewayReady
+from flight.interrupt import Interrupt
+from flight.landing import Landing
+from flight.lidar import ScipDriver, open_lidar
+from flight.link import VehicleLink, check_port_is_free
+from flight.mission import Mission, goal_problem, takeoff_problem
+from flight.offboard import Ending, OffboardFlight
+from flight.preflight import (
+    LOOP_RATE_HZ,
+    Check,
+    Level,
+    check_goal_clear,
+    check_lidar,
+    check_policy,
+    check_start,
+    check_vehicle,
+    require,
+)
+from flight.px4 import FlightMode, mode_name
+from flight.results import truth_from_report
+from flight.status import Status
+from flight.summary import build_summary, write_json_atomic
+from flight.tick import Pilot
+from flight.trajectory import draw_trajectory_png, write_trajectory_csv
+from policy_export.errors import PolicyError
+from policy_export.runner import PolicyRunner
+from safety.filter import SafetyFilter
+from safety.frames import CorridorFrame, CorridorVector, NedVector
+
+log = logging.getLogger("fly")
+
+ANCHOR_SAMPLES = 25
+ANCHOR_PERIOD_S = 0.04
+HEIGHT_TOLERANCE_M = 0.5
+STILL_SPEED_M_S = 0.25
+STILL_FOR_S = 1.0
+BRAKE_S = 1.0
+ARM_RETRY_S = 0.5
+TAKEOFF_MODES = (FlightMode.TAKEOFF, FlightMode.HOLD)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Mission geometry with every `world` filled in. Corridor frame, m."""
+
+    takeoff_point: tuple[float, float]
+    start_yaw_rad: float
+    goal: CorridorVector
+
+
+@dataclass(slots=True)
+class FlightResult:
+    """What came of it. `summary` is the content of summary.json; empty where nothing was flown."""
+
+    exit_code: ExitCode
+    outcome: str
+    message: str
+    folder: Path
+    summary: dict[str, object] = field(default_factory=dict)
+
+
+class FlightSession:
+    """Runs one mission once. `run` raises `FlyError` for everything that ends before arming."""
+
+    def __init__(self, mission: Mission, folder: Path, status: Status, interrupt: Interrupt) -> None:
+        self._mission, self._folder, self._status, self._interrupt = mission, folder, status, interrupt
+        self._events: list[str] = []
+        self._gateway: GatewayProcess | None = None
+        self._ready: GatewayReady | None = None
+
+    def run(self) -> FlightResult:
+        """The whole flight. Raises `FlyError` (nothing armed) or `Interrupted` (stopped before arming)."""
+        policy = self._load_policy()
+        with ExitStack() as stack:
+            self._start_gateway(stack)
+            place = self._place()
+            lidar = stack.enter_context(open_lidar(self._lidar_source()))
+            link = stack.enter_context(VehicleLink(self._url()))
+            self._connect(link, lidar)
+            self._preflight(link, lidar, policy, place)
+            frame = self._anchor(link, place)
+            pilot = Pilot(policy, SafetyFilter(self._mission.safety), place.goal, self._mission.goal.radius_m)
+            flight = OffboardFlight(link, lidar, pilot, frame, self._mission, self._interrupt, self._status)
+            ending, landed = self._fly(link, flight, frame)
+            link.close()
+            stack.close()  # the gateway writes its report when it ends
+        return self._results(flight, policy, place, ending, landed)
+
+    # -- before arming ------------------------------------------------------------------------------------------
+
+    def _load_policy(self) -> PolicyRunner:
+        section = self._mission.policy
+        try:
+            return PolicyRunner.load(section.path, rate_hz=LOOP_RATE_HZ, expected_sha256=section.sha256)
+        except PolicyError as error:
+            raise MissionError(f"policy.path {section.path}: {error}") from None
+
+    def _start_gateway(self, stack: ExitStack) -> None:
+        mission, sim = self._mission, self._mission.sim
+        if not mission.simulated or sim is None:
+            return
+        check_port_is_free(self._url())
+        arguments = ["--world", str(sim.world), "--seed", str(sim.seed), "--dynamics", sim.dynamics, "--estimate", sim.estimate]
+        arguments += ["--onboard-port", str(sim.onboard_port), "--gcs-port", str(sim.gcs_port)]
+        arguments += ["--lidar-port", str(mission.lidar.port), "--wind=" + ",".join(map(repr, sim.wind_m_s))]
+        if mission.frame.takeoff_point_m != "world":
+            arguments.append("--start=" + ",".join(map(repr, mission.frame.takeoff_point_m)))
+        if mission.goal.position_m != "world":
+            arguments.append("--goal=" + ",".join(map(repr, mission.goal.position_m)))
+        if mission.frame.heading_deg != "vehicle":
+            arguments.append(f"--heading={mission.frame.heading_deg!r}")
+        self._status.phase(f"starting the simulator: {sim.world.name}, seed {sim.seed} (the first start compiles for a minute)")
+        self._gateway = stack.enter_context(GatewayProcess(arguments, self._folder / "gateway.json"))
+        self._ready = self._gateway.start(mission.timeouts.gateway_s, self._interrupt.check)
+
+    def _place(self) -> Place:
+        """Takeoff point and goal as numbers; what the world filled in is checked like what the file said."""
+        mission, ready = self._mission, self._ready
+        takeoff, goal = mission.frame.takeoff_point_m, mission.goal.position_m
+        if ready is not None:
+            takeoff = ready.start[:2] if takeoff == "world" else takeoff
+            goal = ready.goal if goal == "world" else goal
+        if takeoff == "world" or goal == "world":
+            raise MissionError("`world` positions need vehicle.connection: sim; give numbers")
+        place = Place(takeoff, ready.start_yaw_rad if ready is not None else 0.0, CorridorVector(*goal))
+        for problem in (
+            goal_problem(place.goal, mission.safety),
+            takeoff_problem(takeoff, mission.takeoff_height_m, mission.safety),
+        ):
+            if problem is not None:
+                raise RefusedError(f"this world does not fit the mission: {problem}")
+        if ready is not None:
+            require(check_start(takeoff, mission.takeoff_height_m, ready.boxes, mission.safety))
+            require(check_goal_clear(place.goal, ready.boxes, mission.safety))
+        return place
+
+    def _url(self) -> str:
+        sim = self._mission.sim
+        return f"udpin://127.0.0.1:{sim.onboard_port}" if self._mission.simulated and sim else self._mission.vehicle.connection
+
+    def _lidar_source(self) -> Any:
+        return self._mission.lidar.model_copy(update={"host": "127.0.0.1"}) if self._mission.simulated else self._mission.lidar
+
+    def _connect(self, link: VehicleLink, lidar: ScipDriver) -> None:
+        timeouts, source = self._mission.timeouts, self._mission.lidar
+        self._status.phase(f"connecting to the vehicle on {link.url}")
+        link.connect(timeouts.connect_s, self._interrupt.check)
+        self._status.phase(f"vehicle {link.system_id} answers; waiting for the LiDAR on {source.host}:{source.port}")
+        deadline = time.monotonic() + timeouts.lidar_s
+        while lidar.health().scans < ANCHOR_SAMPLES:
+            self._interrupt.check()
+            if time.monotonic() > deadline:
+                health = lidar.health()
+                reason = f" ({health.last_error})" if health.last_error else ""
+                raise RefusedError(
+                    f"LiDAR not answering on {source.host}:{source.port} within {timeouts.lidar_s:g} s{reason}: check that it is "
+                    "powered and `lidar.host` and `lidar.port` in the mission"
+                )
+            lidar.wait_for_scan(0.2)
+
+    def _preflight(self, link: VehicleLink, lidar: ScipDriver, policy: PolicyRunner, place: Place) -> None:
+        mission = self._mission
+        link.request_stream_rates(mission.vehicle.stream_rate_hz)
+        self._wait(lambda: link.telemetry.imu is not None and link.telemetry.position is not None, link, mission.timeouts.ready_s)
+        now_s = time.monotonic()
+        checks = check_vehicle(link.telemetry, now_s) + check_lidar(lidar.latest(), lidar.health(), now_s)
+        checks += check_policy(policy.metadata, mission.safety)
+        if self._ready is not None:
+            checks += check_start(place.takeoff_point, mission.takeoff_height_m, self._ready.boxes, mission.safety)
+            checks += check_goal_clear(place.goal, self._ready.boxes, mission.safety)
+        if all(check.level is not Level.FAIL for check in checks):
+            checks.append(self._set_loss_action(link))
+        self._status.checks(checks)
+        require(checks)
+
+    def _set_loss_action(self, link: VehicleLink) -> Check:
+        """PX4's reaction to a stream that stops: written, and read back from the vehicle."""
+        failsafe = self._mission.failsafe
+        seen = f"{failsafe.setpoint_loss_action} after {failsafe.setpoint_loss_timeout_s:g} s"
+        try:
+            link.set_parameter("COM_OF_LOSS_T", failsafe.setpoint_loss_timeout_s)
+            link.set_parameter("COM_OBL_RC_ACT", int(failsafe.loss_action))
+        except VehicleCommandError as error:
+            return Check("setpoint loss", Level.FAIL, str(error), "fly engages only when PX4's own failsafe is known")
+        return Check("setpoint loss", Level.PASS, seen)
+
+    def _anchor(self, link: VehicleLink, place: Place) -> CorridorFrame:
+        """The corridor frame through the spot where the vehicle stands, from the mean of a second of samples."""
+        positions: list[NedVector] = []
+        yaws: list[float] = []
+        for _ in range(ANCHOR_SAMPLES):
+            self._interrupt.check()
+            if link.telemetry.position is not None and link.telemetry.attitude is not None:
+                positions.append(link.telemetry.position.position)
+                yaws.append(link.telemetry.attitude.yaw_rad)
+            time.sleep(ANCHOR_PERIOD_S)
+        if not positions:
+            raise RefusedError("the vehicle stopped telling its position before arming: check the link")
+        yaw = math.atan2(float(np.mean(np.sin(yaws))), float(np.mean(np.cos(yaws))))
+        heading_deg = self._mission.frame.heading_deg
+        heading = yaw + place.start_yaw_rad if heading_deg == "vehicle" else math.radians(heading_deg)
+        mean = NedVector(*(float(np.mean([getattr(p, axis) for p in positions])) for axis in "xyz"))
+        return CorridorFrame.anchored(mean, CorridorVector(*place.takeoff_point, 0.0), heading)
+
+    # -- armed --------------------------------------------------------------------------------------------------
+
+    def _fly(self, link: VehicleLink, flight: OffboardFlight, frame: CorridorFrame) -> tuple[Ending, bool]:
+        """Arm to disarm. From arming on, every exception ends in the landing."""
+        self._arm(link)
+        try:
+            ending = self._take_off(link, frame) or self._engage_and_run(flight)
+        except VehicleCommandError as error:
+            ending = Ending("vehicle_refused", ExitCode.NOT_REACHED, str(error))
+        except Exception as error:  # armed: whatever it is, the vehicle must come down
+            log.exception("unexpected error in flight")
+            ending = Ending("internal_error", ExitCode.SAFETY_ENDED, f"{type(error).__name__}: {error}")
+        self._status.phase(ending.message)
+        if not ending.in_control:
+            return ending, link.telemetry.armed is False
+        if link.mode == FlightMode.OFFBOARD:
+            flight.brake(BRAKE_S)
+        landing = Landing(link, self._status, self._interrupt, self._mission.timeouts.land_s)
+        landed = landing.land(flight.stay if link.mode == FlightMode.OFFBOARD else None)
+        self._events += [*flight.events, *landing.events]
+        return ending, landed
+
+    def _arm(self, link: VehicleLink) -> None:
+        """Arm from Hold; PX4 refuses while its estimate settles, so ask again until the deadline. Raises `RefusedError`."""
+        if link.mode != FlightMode.HOLD:
+            link.set_mode(FlightMode.HOLD)
+        deadline = time.monotonic() + self._mission.timeouts.ready_s
+        self._status.phase("arming")
+        while True:
+            self._interrupt.check()
+            try:
+                link.arm()
+                return
+            except VehicleCommandError as error:
+                if link.armed:
+                    return
+                if time.monotonic() > deadline:
+                    raise RefusedError(f"arming refused for {self._mission.timeouts.ready_s:g} s: {error}") from None
+            self._pause(ARM_RETRY_S)
+
+    def _take_off(self, link: VehicleLink, frame: CorridorFrame) -> Ending | None:
+        """Climb with PX4's own takeoff until height and speed are steady. An ending when that is not to be."""
+        mission, height_m = self._mission, self._mission.takeoff_height_m
+        self._status.phase(f"taking off to {height_m:g} m")
+        link.take_off(height_m)
+        deadline = time.monotonic() + mission.timeouts.takeoff_s
+        steady_since, left_ground = math.nan, False
+        while time.monotonic() < deadline:
+            if self._interrupt.requested:
+                return Ending("stopped", ExitCode.NOT_REACHED, f"stopped by {self._interrupt.name} during takeoff: landing")
+            if link.telemetry.armed is False:
+                return Ending("disarmed", ExitCode.NOT_REACHED, "disarmed during takeoff", in_control=False)
+            left_ground = left_ground or link.mode == FlightMode.TAKEOFF
+            if left_ground and link.mode not in TAKEOFF_MODES:
+                message = f"mode {mode_name(link.mode)} was not commanded by fly: control given up"
+                return Ending("pilot_took_over", ExitCode.NOT_REACHED, message, in_control=False)
+            steady_since = self._steady_since(link, frame, steady_since)
+            if time.monotonic() - steady_since >= STILL_FOR_S:
+                return None
+            time.sleep(0.02)
+        return Ending(
+            "takeoff_timeout", ExitCode.NOT_REACHED, f"height not reached within {mission.timeouts.takeoff_s:g} s: landing"
+        )
+
+    def _steady_since(self, link: VehicleLink, frame: CorridorFrame, since_s: float) -> float:
+        """Since when height and speed have been within tolerance, NaN while they are not."""
+        state = link.state(frame)
+        if state is None:
+            return math.nan
+        speed = math.hypot(state.velocity.x, state.velocity.y, state.velocity.z)
+        steady = abs(state.position.z - self._mission.takeoff_height_m) < HEIGHT_TOLERANCE_M and speed < STILL_SPEED_M_S
+        if not steady:
+            return math.nan
+        return time.monotonic() if math.isnan(since_s) else since_s
+
+    def _engage_and_run(self, flight: OffboardFlight) -> Ending:
+        self._status.phase("height reached; switching to OFFBOARD")
+        flight.engage()
+        self._status.phase("the policy flies (Ctrl-C: brake, hold, land)")
+        return flight.run()
+
+    def _pause(self, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline and not self._interrupt.requested:
+            time.sleep(0.02)
+
+    def _wait(self, condition: Any, link: VehicleLink, timeout_s: float) -> None:
+        """Wait before arming; what is still missing then fails its own check."""
+        link.wait_until(condition, timeout_s, self._interrupt.check)
+
+    # -- results ------------------------------------------------------------------------------------------------
+
+    def _results(self, flight: OffboardFlight, policy: PolicyRunner, place: Place, ending: Ending, landed: bool) -> FlightResult:
+        report = self._gateway.report() if self._gateway is not None else {}
+        contacts = report.get("contacts")
+        exit_code, outcome, message = _judge(ending, landed, contacts)
+        summary = build_summary(
+            flight.log,
+            flight.keeper.statistics(),
+            outcome=outcome,
+            goal=place.goal,
+            goal_reached=ending.outcome == "goal_reached",
+            policy_path=str(self._mission.policy.path),
+            policy_sha256=policy.sha256,
+            dynamics=self._mission.sim.dynamics if self._mission.simulated and self._mission.sim else "vehicle",
+            collisions=contacts,
+            min_clearance_m=report.get("min_clearance_m"),
+            failsafe_events=self._events,
+            extra={
+                "message": message,
+                "exit_code": int(exit_code),
+                "landed": landed,
+                "mission": self._mission.name,
+                "seed": self._mission.sim.seed if self._mission.sim else None,
+                "goal_m": [place.goal.x, place.goal.y, place.goal.z],
+                "true_distance_to_goal_m": _true_distance(report, place.goal),
+            },
+        )
+        write_json_atomic(self._folder / "summary.json", summary)
+        write_trajectory_csv(self._folder / "trajectory.csv", flight.log)
+        self._draw(flight, place, report, f"{self._mission.name}: {outcome}")
+        return FlightResult(exit_code, outcome, message, self._folder, summary)
+
+    def _draw(self, flight: OffboardFlight, place: Place, report: dict[str, Any], title: str) -> None:
+        boxes = np.array(self._ready.boxes, dtype=np.float64).reshape(-1, 6) if self._ready is not None else None
+        draw_trajectory_png(
+            self._folder / "trajectory.png",
+            flight.log,
+            boxes=boxes,
+            goal=place.goal,
+            goal_radius_m=self._mission.goal.radius_m,
+            fence=self._mission.safety.fence,
+            truth=truth_from_report(report),
+            title=title,
+        )
+
+
+def _judge(ending: Ending, landed: bool, contacts: Any) -> tuple[ExitCode, str, str]:
+    """Exit code, outcome and message of the whole flight: a contact or a failed landing outweighs a reached goal."""
+    if contacts:
+        return ExitCode.NOT_REACHED, "contact", f"touched an obstacle {contacts} time(s); {ending.message}"
+    if ending.exit_code is ExitCode.GOAL_REACHED and not landed:
+        return ExitCode.NOT_REACHED, "not_landed", f"{ending.message}, but not landed"
+    return ending.exit_code, ending.outcome, ending.message
+
+
+def _true_distance(report: dict[str, Any], goal: CorridorVector) -> float | None:
+    """Nearest true distance to the goal, where a simulator knows it."""
+    truth = truth_from_report(report)
+    if truth is None:
+        return None
+    return float(np.min(np.linalg.norm(truth - (goal.x, goal.y, goal.z), axis=1)))
