@@ -89,7 +89,7 @@ class Autopilot:
         self._ready_after_s = ready_after_s
         self._altitude_amsl_m = altitude_amsl_m
         self._setpoint = OffboardSetpoint(velocity=(0.0, 0.0, 0.0))
-        self._setpoint_time_s = -math.inf
+        self._setpoint_time_s, self._setpoint_fresh = -math.inf, False
         self._after_disarming = FlightMode.LOITER
         self._task: FlightTask | None = None
         self._task_target: Vector | None = None
@@ -146,7 +146,7 @@ class Autopilot:
     def set_setpoint(self, setpoint: OffboardSetpoint) -> None:
         """A valid offboard setpoint arrived now."""
         self._setpoint = setpoint
-        self._setpoint_time_s = self.now_s
+        self._setpoint_time_s, self._setpoint_fresh = self.now_s, True
 
     def arm(self, force: bool = False) -> Result:
         """Arm; `force` skips the checks."""
@@ -230,6 +230,8 @@ class Autopilot:
         dt_s = CONTROL_PERIOD_S if self._last_step_s is None else max(state.time_s - self._last_step_s, 0.0)
         self._last_step_s = state.time_s
         self.state = state
+        if self._setpoint_fresh:  # it came between the last step and this one: the stream's clock starts now
+            self._setpoint_time_s, self._setpoint_fresh = state.time_s, False
         if not self.armed:
             self.landed = self.landed or state.on_ground
             return self.output

@@ -142,9 +142,16 @@ def _follow_parent(stop: threading.Event) -> None:
             if os.getppid() != parent:
                 stop.set()
 
-    piped = stat.S_ISFIFO(os.fstat(0).st_mode) or stat.S_ISSOCK(os.fstat(0).st_mode)
-    for watcher in (read_to_end, watch_parent) if piped else (watch_parent,):
+    for watcher in (read_to_end, watch_parent) if _stdin_is_pipe() else (watch_parent,):
         threading.Thread(target=watcher, daemon=True).start()
+
+
+def _stdin_is_pipe() -> bool:
+    try:
+        mode = os.fstat(0).st_mode
+    except OSError:  # no stdin at all
+        return False
+    return stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode)
 
 
 def _load(path: Path, seed: int | None, start: str | None, goal: str | None) -> World:

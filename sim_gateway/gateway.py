@@ -69,7 +69,7 @@ class Gateway:
         self.vehicle = PilotedVehicle(_simulation(world, config), heading_rad=config.heading_rad)
         pilot, frame = self.vehicle.autopilot, self.vehicle.frame
         self.recorder = FlightRecorder(self.vehicle.simulation, self._facts())
-        telemetry = Telemetry(pilot, frame, self.vehicle.snapshot)
+        telemetry = Telemetry(pilot, frame, self.vehicle.snapshot, lambda: self.vehicle.time_s)
         onboard = (config.onboard_port + ONBOARD_PORT_OFFSET, config.onboard_port)
         ground = (config.gcs_port + GROUND_PORT_OFFSET, config.gcs_port) if config.gcs_port else None
         self.server = MavlinkServer(pilot, frame, telemetry, onboard, ground)

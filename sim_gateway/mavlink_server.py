@@ -129,11 +129,11 @@ class MavlinkLink:
         stream = self.streams.get(name)
         return -1 if stream is None else round(stream.interval_s * 1e6)
 
-    def due(self) -> list[str]:
+    def due(self, available: Callable[[str], bool]) -> list[str]:
         """Names of the messages whose time has come. A stream that fell behind skips what it missed."""
         now_s, names = self._now_s(), []
         for name, stream in self.streams.items():
-            if now_s >= stream.due_s - 1e-9:
+            if now_s >= stream.due_s - 1e-9 and available(name):
                 names.append(name)
                 behind = now_s - stream.due_s > stream.interval_s
                 stream.due_s = now_s + stream.interval_s if behind else stream.due_s + stream.interval_s
@@ -144,6 +144,7 @@ class MavlinkLink:
     def receive(self) -> list[Message]:
         """The valid messages that have arrived; bad bytes, wrong checksums and foreign hosts are dropped."""
         messages: list[Message] = []
+        self._forget_silent_peers()
         for _ in range(_DATAGRAMS_PER_POLL):
             try:
                 data, peer = self.socket.recvfrom(_MAX_DATAGRAM)
@@ -160,12 +161,14 @@ class MavlinkLink:
 
     def _remember(self, peer: tuple[str, int]) -> None:
         """Answer a client on another port too, for as long as it speaks."""
-        now_s = self._now_s()
-        for old in [p for p, heard_s in self._peers.items() if now_s - heard_s > _PEER_TIMEOUT_S]:
-            del self._peers[old]
         known = peer in self._peers or len(self._peers) < _PEERS_PER_LINK
         if peer != self._client and known and peer[0].startswith("127."):
-            self._peers[peer] = now_s
+            self._peers[peer] = self._now_s()
+
+    def _forget_silent_peers(self) -> None:
+        if self._peers:
+            oldest_s = self._now_s() - _PEER_TIMEOUT_S
+            self._peers = {peer: heard_s for peer, heard_s in self._peers.items() if heard_s >= oldest_s}
 
 
 def _parse(data: bytes) -> list[Message]:
@@ -192,6 +195,7 @@ class MavlinkServer:
         ground_ports: tuple[int, int] | None = GROUND_PORTS,
     ) -> None:
         self._autopilot, self._frame, self._telemetry = autopilot, frame, telemetry
+        self._now = telemetry.now_s
         self._commands = CommandHandler(autopilot, telemetry, frame)
         self.links = [MavlinkLink("onboard", *onboard_ports, ONBOARD, self._now)]
         try:
@@ -219,9 +223,6 @@ class MavlinkServer:
             "PING": self._on_ping,
         }
 
-    def _now(self) -> float:
-        return self._autopilot.now_s
-
     def close(self) -> None:
         """Free the ports."""
         for link in self.links:
@@ -234,9 +235,8 @@ class MavlinkServer:
                 self._dispatch(message, link)
         self._send_changes()
         for link in self.links:
-            for name in link.due():
-                if self._telemetry.available(name):
-                    link.send(self._telemetry.build(name))
+            for name in link.due(self._telemetry.available):
+                link.send(self._telemetry.build(name))
             for _ in range(min(_PARAMS_PER_POLL, len(link.parameter_queue))):
                 self._send_parameter(link.parameter_queue.popleft(), link)
 

@@ -104,9 +104,12 @@ def _clamp_int(value: float, low: int, high: int) -> int:
 
 
 class Telemetry:
-    """Builds messages for the vehicle's present state. `snapshot` is called once per message."""
+    """Builds messages for the vehicle's present state. `snapshot` is called once per message, `now_s` gives vehicle time."""
 
-    def __init__(self, autopilot: Autopilot, frame: LocalFrame, snapshot: Callable[[], Snapshot]) -> None:
+    def __init__(
+        self, autopilot: Autopilot, frame: LocalFrame, snapshot: Callable[[], Snapshot], now_s: Callable[[], float]
+    ) -> None:
+        self.now_s = now_s
         self._autopilot = autopilot
         self._frame = frame
         self._snapshot = snapshot
@@ -122,7 +125,7 @@ class Telemetry:
 
     def available(self, name: str) -> bool:
         """Whether start-up has come far enough for this message."""
-        return self._autopilot.now_s >= _FROM_S.get(name, LOCAL_FROM_S)
+        return self.now_s() >= _FROM_S.get(name, LOCAL_FROM_S)
 
     def build(self, name: str) -> Message:
         """The message now; raises KeyError for a name outside the tables."""
