@@ -228,13 +228,13 @@ def _draw_path(figure: Figure, axes: Axes, log: FlightLog, truth: NDArray[np.flo
     from matplotlib.collections import LineCollection  # noqa: PLC0415
 
     if truth is not None and len(truth):
-        axes.plot(truth[:, 0], truth[:, 1], color="black", linewidth=0.7, zorder=6, label="true path")
+        axes.plot(truth[:, 0], truth[:, 1], color="black", linewidth=1.0, zorder=5, label="true path")
     flown = [r for r in log.records if r.position is not None and r.velocity is not None]
     points = log.positions_m[:, :2]
     if len(points) < 2:
         return
     speeds = [math.hypot(r.velocity.x, r.velocity.y) for r in flown[1:] if r.velocity is not None]
-    path = LineCollection(list(pairwise(map(tuple, points))), cmap="viridis", linewidth=3.0, zorder=5, capstyle="round")
+    path = LineCollection(list(pairwise(map(tuple, points))), cmap="viridis", linewidth=2.6, zorder=6, capstyle="round")
     path.set_array(np.array(speeds))
     path.set_clim(0.0, max(0.1, float(np.max(speeds))))
     axes.add_collection(path)
@@ -243,8 +243,14 @@ def _draw_path(figure: Figure, axes: Axes, log: FlightLog, truth: NDArray[np.flo
     axes.plot(
         *points[0], "o", markerfacecolor="white", markeredgecolor="black", markersize=8, zorder=8, label="start", linestyle="none"
     )
-    _mark(axes, flown, braking=False, style={"marker": "o", "color": "#f39c12", "markersize": 3.5}, label="command limited")
-    _mark(axes, flown, braking=True, style={"marker": "X", "color": "#e74c3c", "markersize": 6.0}, label="braking")
+    _mark(
+        axes,
+        flown,
+        braking=False,
+        style={"marker": "o", "color": "#f8c471", "markersize": 8.0, "zorder": 4},
+        label="command limited",
+    )
+    _mark(axes, flown, braking=True, style={"marker": "X", "color": "#e74c3c", "markersize": 7.0, "zorder": 7}, label="braking")
 
 
 def _mark(axes: Axes, flown: list[TickRecord], *, braking: bool, style: dict[str, object], label: str) -> None:
@@ -252,7 +258,7 @@ def _mark(axes: Axes, flown: list[TickRecord], *, braking: bool, style: dict[str
     if not marked:
         return
     xs, ys = [p.x for p in marked if p is not None], [p.y for p in marked if p is not None]
-    axes.plot(xs, ys, linestyle="none", markeredgewidth=0.0, zorder=7, label=f"{label} ({len(marked)} ticks)", **style)  # type: ignore[arg-type]
+    axes.plot(xs, ys, linestyle="none", markeredgewidth=0.0, label=f"{label} ({len(marked)} ticks)", **style)  # type: ignore[arg-type]
 
 
 def _finish(figure: Figure, axes: Axes, title: str) -> None:
@@ -266,5 +272,5 @@ def _finish(figure: Figure, axes: Axes, title: str) -> None:
         axes.set_title(title, fontsize=11, loc="left")
     width_m, height_m = (max(1.0, abs(b - a)) for a, b in (axes.get_xlim(), axes.get_ylim()))
     scale = min(14.0 / width_m, 9.0 / height_m)
-    figure.set_size_inches(max(6.0, width_m * scale + 1.2), max(3.2, height_m * scale + 1.6))
+    figure.set_size_inches(max(6.0, width_m * scale + 1.2), max(3.2, height_m * scale + 1.25))
     figure.legend(loc="outside lower center", ncols=6, fontsize=8, frameon=False)

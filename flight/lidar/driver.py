@@ -29,6 +29,7 @@ CLOCK_READINGS = 8
 _RATE_WINDOW = 40
 _POLL_S = 0.1
 _DRAINED_REPLIES = 64
+_QUIT_TIMEOUT_S = 0.2
 _CLOSE_TIMEOUT_S = 3.0
 
 
@@ -36,8 +37,8 @@ _CLOSE_TIMEOUT_S = 3.0
 class LidarHealth:
     """What the driver knows of itself. `rate_hz` and `age_s` are NaN before there are scans.
 
-    `age_s`: now minus the newest scan's own measurement time. `reconnects`: connections after the first one.
-    `last_error`: why the link is or was down, empty if it never was.
+    `age_s`: now minus the newest scan's own measurement time. `rate_hz`: of this connection's last scans. `reconnects`:
+    connections after the first one. `last_error`: why the link is or was down, empty if it never was.
     """
 
     connected: bool
@@ -113,10 +114,10 @@ class ScipDriver:
     def health(self) -> LidarHealth:
         """A snapshot; cheap enough for every tick."""
         with self._fresh:
-            health, measured = self._health, tuple(self._measured)
+            health, measured, scan = self._health, tuple(self._measured), self._scan
         span_s = measured[-1] - measured[0] if len(measured) > 1 else 0.0
         rate_hz = (len(measured) - 1) / span_s if span_s > 0.0 else math.nan
-        age_s = self._clock() - measured[-1] if measured else math.nan
+        age_s = self._clock() - scan.time_s if scan is not None else math.nan
         return replace(health, rate_hz=rate_hz, age_s=age_s)
 
     def _run(self) -> None:
@@ -214,8 +215,11 @@ class _ScipSession:
         return self._parameters
 
     def quit(self) -> None:
-        """Stop stream and laser; the answer is not waited for."""
-        self._transport.write(scip.request("QT"), self._config.reply_timeout_s)
+        """Stop stream and laser. Waits a moment for the answer: closing on unread data could overtake the request."""
+        self._transport.write(scip.request("QT"), _QUIT_TIMEOUT_S)
+        deadline_s = self._now() + _QUIT_TIMEOUT_S
+        while self._now() < deadline_s and not any(reply.echo == "QT" for reply in self._pending):
+            self._receive(_QUIT_TIMEOUT_S / 4.0)
 
     def scans(self) -> Iterator[LidarScan]:
         """Start the stream and give its scans until the driver stops. Raises when the device stalls or the link breaks."""
