@@ -12,7 +12,7 @@ import sys
 import threading
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -79,28 +79,23 @@ def serve(
 
     Prints one JSON line to stdout when ready. Ctrl-C or SIGTERM stops it and writes the report.
     """
-    from strict_yaml import ConfigError
-
     _log_to_stderr(verbose)
-    try:
-        scene = _load(world, seed, start, goal)
-        from sim_gateway.gateway import GatewayConfig
+    scene = _load(world, seed, start, goal)
+    from sim_gateway.gateway import GatewayConfig
 
-        config = GatewayConfig(
-            seed=scene.seed,
-            onboard_port=onboard_port,
-            gcs_port=gcs_port,
-            lidar_port=lidar_port,
-            estimate=estimate.value,
-            wind_m_s=_triple("--wind", wind),
-            heading_rad=math.radians(_finite("--heading", heading)),
-            speed=_finite("--speed", speed),
-            max_time_s=max_time or math.inf,
-            report=report,
-        )
-        _serve(scene, config, quit_with_parent)
-    except (_UsageError, ConfigError) as error:
-        _fail(str(error))
+    config = GatewayConfig(
+        seed=scene.seed,
+        onboard_port=onboard_port,
+        gcs_port=gcs_port,
+        lidar_port=lidar_port,
+        estimate=estimate.value,
+        wind_m_s=_triple("--wind", wind),
+        heading_rad=math.radians(_finite("--heading", heading)),
+        speed=speed,
+        max_time_s=max_time or math.inf,
+        report=report,
+    )
+    _serve(scene, config, quit_with_parent)
 
 
 def _serve(world: World, config: GatewayConfig, quit_with_parent: bool) -> None:
@@ -164,16 +159,15 @@ def _load(path: Path, seed: int | None, start: str | None, goal: str | None) -> 
     from sim_gateway.world import load_world
 
     world = load_world(path, seed)
-    changes = {}
     if start is not None:
         x, y = _numbers("--start", start, 2)
-        changes["start"] = (x, y, 0.0)
+        world = replace(world, start=(x, y, 0.0))
     if goal is not None:
-        changes["goal"] = _triple("--goal", goal)
-    for name, point in changes.items():
+        world = replace(world, goal=_triple("--goal", goal))
+    for name, point in (("start", world.start), ("goal", world.goal)):
         if clearance_m(world.boxes_at(0.0), np.array(point), 0.0) <= 0.0:
             raise _UsageError(f"--{name} {point} lies inside an obstacle: choose another place")
-    return replace(world, **changes)
+    return world
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:
@@ -207,11 +201,18 @@ def _log_to_stderr(verbose: bool) -> None:
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 
-def _fail(message: str) -> NoReturn:
-    print(f"sim-gateway: {message}", file=sys.stderr)
-    raise typer.Exit(2)
-
-
 def main() -> None:
-    """Entry point."""
-    app()
+    """Entry point: a user's mistake is one line on stderr and exit code 2."""
+    from strict_yaml import ConfigError
+
+    try:
+        code = app(standalone_mode=False)
+    except (_UsageError, ConfigError) as error:
+        print(f"sim-gateway: {error}", file=sys.stderr)
+        code = 2
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # typer's usage errors have no public base class
+            raise
+        print(f"sim-gateway: {error.format_message()} See sim-gateway --help.", file=sys.stderr)
+        code = 2
+    sys.exit(int(code or 0))

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from pymavlink.dialects.v20 import development as mav
 
@@ -17,7 +18,7 @@ from sim_gateway.autopilot import Autopilot
 from sim_gateway.local_frame import LocalFrame, Vector
 from sim_gateway.setpoints import OffboardSetpoint
 
-Message = mav.MAVLink_message
+Message = Any  # pymavlink publishes no types
 Quaternion = tuple[float, float, float, float]
 SYSTEM_ID, COMPONENT_ID = 1, 1
 
