@@ -117,6 +117,12 @@ def _serve(world: World, config: GatewayConfig, quit_with_parent: bool) -> None:
         raise _UsageError(f"{error} with --lidar-port") from None
     with gateway:
         print(json.dumps(gateway.ready_message()), flush=True)
+        logging.getLogger("sim_gateway").info(
+            "world %s: MAVLink to udpin://127.0.0.1:%d, LiDAR on TCP port %d; Ctrl-C stops",
+            world.name,
+            config.onboard_port,
+            gateway.lidar.port,
+        )
         gateway.run(stop)
 
 
