@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import zipfile
 from pathlib import Path
+from pickle import UnpicklingError  # what torch.load raises on a file that is not plain data
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,7 @@ def load_checkpoint(path: Path, resume: bool = False) -> dict[str, Any]:
         EOFError,
         KeyError,
         zipfile.BadZipFile,
-        torch.serialization.pickle.UnpicklingError,
+        UnpicklingError,
     ) as error:
         raise CheckpointError(f"{path}: not a readable checkpoint ({str(error).splitlines()[0]})") from None
     needed = EXPORT_KEYS + (RESUME_KEYS if resume else ())

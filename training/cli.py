@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -23,7 +25,7 @@ train-policy --config configs/training/ppo_lstm.yaml --out runs/night --seed 3 -
 train-policy --resume runs/night
 """
 
-app = typer.Typer(add_completion=False, rich_markup_mode="rich")
+app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
 
 
 class _UsageError(Exception):
@@ -54,6 +56,8 @@ def train(
         result = _run(config, out, resume, {"seed": seed, "decisions": decisions and int(decisions)}, device, threads)
     except (_UsageError, ConfigError, CheckpointError) as error:
         _fail(str(error), 2)
+    except KeyboardInterrupt:
+        _fail("stopped at once; the last checkpoint is good", 130)
     except TrainingDivergedError as error:
         _fail(f"training diverged: {error}; the last checkpoint is good", 1)
     if as_json:
@@ -133,22 +137,45 @@ def _check_device(device: str) -> None:
 
 
 def _train(trainer: Trainer) -> bool:
-    """Run to the end with a progress display; True if interrupted (the state is saved)."""
+    """Run to the end with a progress display; True if stopped before (the state is saved)."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
     columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), TextColumn("ETA"), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=120.0) as progress:
+    stop = _StopRequest()
+    with Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=120.0) as progress, stop:
         task = progress.add_task("starting", total=trainer.config.decisions, completed=trainer.decisions)
-        try:
-            for status in trainer.updates():
-                progress.update(task, completed=status.decisions, description=_describe(status))
-                _log(console, trainer, status)
-        except KeyboardInterrupt:
-            trainer.save("last.pt")
-            return True
-    return False
+        for status in trainer.updates():
+            progress.update(task, completed=status.decisions, description=_describe(status))
+            _log(console, trainer, status)
+            if stop.requested:
+                trainer.save("last.pt")
+                break
+    return trainer.decisions < trainer.config.decisions
+
+
+class _StopRequest:
+    """Ctrl-C or SIGTERM asks for a stop after the update in progress, so that what is saved is whole; a second one insists."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> _StopRequest:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._ask)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _ask(self, number: int, _frame: FrameType | None) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+        print("train-policy: stopping after this update (again to stop at once)", file=sys.stderr)
 
 
 def _describe(status: Status) -> str:

@@ -33,17 +33,23 @@ class RewardConfig(StrictModel):
     proximity_per_s: float = Field(default=-3.0, description="times (1 - clearance/range)^2 inside proximity_range_m")
     proximity_range_m: float = Field(default=0.7, gt=0)
     smoothness: float = Field(default=-0.03, description="times the squared change of the normalised action between decisions")
-    blind_motion_per_s: float = Field(default=-0.5, description="times the squared speed (m/s) by which sideways exceeds forward motion")
+    blind_motion_per_s: float = Field(
+        default=-0.5, description="times the squared speed (m/s) by which sideways exceeds forward motion"
+    )
     path_deviation_per_m_s: float = Field(
         default=0.0, description="per metre of distance to the line from start to goal (the article's term)"
+    )
+    velocity_change_per_mps: float = Field(
+        default=0.0, description="per m/s by which the velocity changed between decisions (the article's smoothness term)"
     )
 
 
 class VehicleRandomisation(StrictModel):
     """Relative half-widths by which vehicle parameters vary from episode to episode, and delays."""
 
-    relative: float = Field(default=0.15, ge=0, le=0.5, description="mass, inertia, thrust, drag and lag each vary by +- this share")
-    gain_relative: float = Field(default=0.15, ge=0, le=0.5, description="controller gains vary by +- this share")
+    relative: float = Field(
+        default=0.15, ge=0, le=0.5, description="mass, inertia, thrust, drag and lag each vary by +- this share"
+    )
     command_delay_steps: tuple[int, int] = Field(default=(0, 12), description="4 ms steps by which a command takes effect late")
     scan_age_steps: tuple[int, int] = Field(default=(0, 12), description="4 ms steps by which the scan is older than the tick")
     wind_mps: Range = Field(default=(0.0, 1.5), description="speed of the constant horizontal wind")
@@ -66,7 +72,9 @@ class EnvironmentConfig(StrictModel):
     altitude_band_m: Range = Field(default=(0.5, 4.5), description="leaving it ends the episode like a contact")
     start_altitude_m: Range = (1.5, 3.0)
     start_yaw_rad: float = Field(default=0.35, ge=0, description="start yaw is uniform within +- this")
-    spread_start_share: float = Field(default=0.5, ge=0, le=1, description="episodes that start at a free point along the corridor")
+    spread_start_share: float = Field(
+        default=0.5, ge=0, le=1, description="episodes that start at a free point along the corridor"
+    )
     dropout: Range = (0.0, 0.02)
     lidar_noise_m: float = Field(default=0.01, ge=0)
     pillars: tuple[int, int] = (4, 12)
@@ -90,7 +98,9 @@ class PpoConfig(StrictModel):
     """The learner: proximal policy optimisation over whole sequences (Schulman et al. 2017)."""
 
     environments: int = Field(default=256, ge=1)
-    steps: int = Field(default=64, ge=1, description="decisions per environment and update; the length of back-propagation through time")
+    steps: int = Field(
+        default=64, ge=1, description="decisions per environment and update; the length of back-propagation through time"
+    )
     epochs: int = Field(default=4, ge=1)
     minibatches: int = Field(default=4, ge=1)
     gamma_per_tick: float = Field(default=0.995, gt=0, le=1)

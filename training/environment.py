@@ -36,8 +36,8 @@ _START_CLEARANCE_M = 0.4
 _SPREAD_END_MARGIN_M = 3.0  # spread starts end this far before the goal
 
 
-class CorridorVectorEnv(VectorEnv):  # type: ignore[misc]  # gymnasium is untyped here
-    """``num_envs`` corridors. Observations float32 [N, 190] as ``layout`` says; actions float32 [N, 4] in SI units within ``action``.
+class CorridorVectorEnv(VectorEnv):
+    """``num_envs`` corridors. Observations float32 [N, 190] as ``layout`` says; actions float32 [N, 4] in SI units.
 
     ``worlds`` defaults to a pool of new corridors from the training seeds. Deterministic: equal seeds, equal flights.
     """
@@ -216,6 +216,7 @@ def make_rules(config: EnvironmentConfig, layout: ObservationLayout, action: Act
         smoothness=reward.smoothness,
         blind_motion_per_s=reward.blind_motion_per_s,
         path_deviation_per_m_s=reward.path_deviation_per_m_s,
+        velocity_change_per_mps=reward.velocity_change_per_mps,
     )
 
 

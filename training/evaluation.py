@@ -42,16 +42,17 @@ def evaluate(network: PolicyNetwork, env: CorridorVectorEnv) -> dict[str, Any]:
     """Fly every corridor of ``env`` once. Returns the success rate with its 95 % interval, failures by cause, path figures."""
     observation, _ = env.reset(seed=int(np.random.default_rng(env.num_envs).integers(2**31)))
     h, c = network.initial_state(env.num_envs)
+    device = network.log_std.device
     outcome = np.full(env.num_envs, "time_out", dtype=object)
     ticks, length, clearance = (np.zeros(env.num_envs) for _ in range(3))
     straight = np.linalg.norm(env.arena.goal - env.arena.start, axis=1)
     active = env.arena.active
     while active.any():
         index = np.flatnonzero(active)
-        mean, _, h_next, c_next = network.step(torch.from_numpy(observation[index]), h[:, index], c[:, index])
+        mean, _, h_next, c_next = network.step(torch.from_numpy(observation[index]).to(device), h[:, index], c[:, index])
         h[:, index], c[:, index] = h_next, c_next
         actions = np.zeros((env.num_envs, 4), np.float32)
-        actions[index] = network.action(mean).numpy()
+        actions[index] = network.action(mean).cpu().numpy()
         observation, _, _, _, info = env.step(actions)
         ended = info["ended"]
         outcome[ended] = info["outcomes"]

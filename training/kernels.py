@@ -7,7 +7,7 @@ environments is one call. Frames: corridor (x along, y left, z up) unless a name
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -24,10 +24,13 @@ from sim_gateway.estimate import (
     VELOCITY_ERROR,
     step_error,
 )
+from sim_gateway.kernel_stamp import source_stamp
 from sim_gateway.raycast import cast_beams
 from sim_gateway.scene import place_movers
 
 F64 = NDArray[np.float64]
+
+# Only the two entry points are cached, under a stamp of all sources: numba would not notice a change in another file.
 
 SUBSTEP_S = 0.004
 TICK_S = 0.05
@@ -40,12 +43,14 @@ RUNNING, GOAL, CONTACT, LEFT_BAND, TIME_OUT = range(5)
 OUTCOME_NAMES = ("running", "goal", "contact", "left_band", "time_out")
 
 # reward terms, columns of `Arena.terms`
-PROGRESS, GOAL_BONUS, CONTACT_COST, TIME, PROXIMITY, SMOOTHNESS, BLIND_MOTION, PATH_DEVIATION = range(8)
-TERM_NAMES = ("progress", "goal", "contact", "time", "proximity", "smoothness", "blind_motion", "path_deviation")
+PROGRESS, GOAL_BONUS, CONTACT_COST, TIME, PROXIMITY, SMOOTHNESS, BLIND_MOTION, PATH_DEVIATION, VELOCITY_CHANGE = range(9)
+TERM_NAMES = (
+    "progress", "goal", "contact", "time", "proximity", "smoothness", "blind_motion", "path_deviation", "velocity_change",
+)  # fmt: skip
 
 # columns of `Arena.episode`
-DISTANCE, MIN_CLEARANCE, PATH_LENGTH = range(3)
-EPISODE_COLUMNS = 3
+DISTANCE, MIN_CLEARANCE, PATH_LENGTH, LAST_VELOCITY = range(4)  # the last one is three columns wide
+EPISODE_COLUMNS = 6
 
 
 class Rules(NamedTuple):
@@ -73,6 +78,7 @@ class Rules(NamedTuple):
     smoothness: float
     blind_motion_per_s: float
     path_deviation_per_m_s: float
+    velocity_change_per_mps: float
 
 
 class Arena(NamedTuple):
@@ -102,12 +108,12 @@ class Arena(NamedTuple):
     active: NDArray[np.bool_]
 
 
-@njit(cache=True)
+@njit(cache=False)
 def _distance(a: F64, b: F64) -> float:
     return math.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
-@njit(cache=True)
+@njit(cache=False)
 def scan_into(arena: Arena, rules: Rules, i: int, rng: np.random.Generator) -> None:
     """Cast, disturb and clip one scan as the observation wants it: no return is the maximum range, too near is 0."""
     boxes, state = arena.boxes[i], arena.vehicle[i]
@@ -124,7 +130,7 @@ def scan_into(arena: Arena, rules: Rules, i: int, rng: np.random.Generator) -> N
             out[k] = 0.0 if value < rules.range_min_m else value
 
 
-@njit(cache=True)
+@njit(cache=False)
 def estimate_into(arena: Arena, i: int, advance: bool, rng: np.random.Generator) -> None:
     """Write the estimate the flight stack would see; with `advance` its errors first move on by one tick."""
     state, error, out = arena.vehicle[i], arena.errors[i], arena.estimate[i]
@@ -138,7 +144,7 @@ def estimate_into(arena: Arena, i: int, advance: bool, rng: np.random.Generator)
     out[9] = math.atan2(math.sin(yaw), math.cos(yaw))
 
 
-@njit(cache=True)
+@njit(cache=False)
 def observe_into(arena: Arena, rules: Rules, i: int, out: NDArray[np.float32]) -> None:
     """The observation as policy_export.observation builds it."""
     estimate, n = arena.estimate[i], arena.ranges.shape[1]
@@ -157,7 +163,7 @@ def observe_into(arena: Arena, rules: Rules, i: int, out: NDArray[np.float32]) -
     out[n + 9] = yaw
 
 
-@njit(cache=True)
+@njit(cache=False)
 def _new_command(arena: Arena, rules: Rules, i: int, out: F64) -> None:
     """Turn the action by the estimated yaw, as the flight loop does once per tick."""
     action = arena.action[i]
@@ -168,7 +174,7 @@ def _new_command(arena: Arena, rules: Rules, i: int, out: F64) -> None:
         out[1] = sin * action[0] + cos * action[1]
 
 
-@njit(cache=True)
+@njit(cache=False)
 def _judge(arena: Arena, rules: Rules, i: int) -> tuple[int, float]:
     """Outcome at this moment and the clearance (m)."""
     state = arena.vehicle[i]
@@ -184,14 +190,14 @@ def _judge(arena: Arena, rules: Rules, i: int) -> tuple[int, float]:
     return RUNNING, clearance
 
 
-@njit(cache=True)
+@njit(cache=False)
 def _move_boxes(arena: Arena, i: int, time_s: float) -> None:
     movers = arena.box_count[i, 1]
     if movers > 0:
         place_movers(arena.movers[i], movers, time_s, arena.boxes[i, arena.box_count[i, 0] :])
 
 
-@njit(cache=True)
+@njit(cache=False)
 def fly_tick(arena: Arena, rules: Rules, i: int, scan: bool, rng: np.random.Generator) -> tuple[int, float]:
     """One 50 ms tick of one environment: outcome and smallest clearance (m) seen. With `scan`, the LiDAR is read too."""
     state, params, wind = arena.vehicle[i], arena.params[i], arena.wind[i]
@@ -228,7 +234,7 @@ def fly_tick(arena: Arena, rules: Rules, i: int, scan: bool, rng: np.random.Gene
     return outcome, smallest
 
 
-@njit(cache=True)
+@njit(cache=False)
 def _tick_terms(arena: Arena, rules: Rules, i: int, clearance: float) -> None:
     """Add the terms that are paid per second for one tick."""
     terms, state, dt = arena.terms[i], arena.vehicle[i], TICK_S
@@ -248,7 +254,7 @@ def _tick_terms(arena: Arena, rules: Rules, i: int, clearance: float) -> None:
         terms[PATH_DEVIATION] += rules.path_deviation_per_m_s * off * dt
 
 
-@njit(cache=True)
+@njit(cache=False)
 def _end_terms(arena: Arena, rules: Rules, i: int, action: F64, outcome: int) -> None:
     """Add the terms that are paid once per decision."""
     terms = arena.terms[i]
@@ -258,46 +264,35 @@ def _end_terms(arena: Arena, rules: Rules, i: int, action: F64, outcome: int) ->
     for k in range(4):
         change = (action[k] - arena.action[i, k]) / rules.action_half[k]
         terms[SMOOTHNESS] += rules.smoothness * change * change
+    last_velocity, velocity = arena.episode[i, LAST_VELOCITY : LAST_VELOCITY + 3], arena.vehicle[i, 3:6]
+    terms[VELOCITY_CHANGE] += rules.velocity_change_per_mps * _distance(velocity, last_velocity)
+    last_velocity[:] = velocity
     if outcome == GOAL:
         terms[GOAL_BONUS] += rules.goal
-    elif outcome != RUNNING and outcome != TIME_OUT:
+    elif outcome in (CONTACT, LEFT_BAND):
         terms[CONTACT_COST] += rules.contact
 
 
-@njit(cache=True)
-def step_all(
-    arena: Arena, rules: Rules, actions: F64, hold: int, rng: np.random.Generator, observations: NDArray[np.float32], rewards: F64
-) -> None:
-    """One decision of all active environments: fly `hold` ticks, then scan, observe [N, 190] and reward [N].
-
-    `actions` [N, 4] are in SI units within the limits. Writes `arena.outcome`, `arena.terms`.
-    """
-    for i in range(actions.shape[0]):
-        if not arena.active[i]:
-            continue
-        arena.terms[i] = 0.0
-        outcome = RUNNING
-        previous = arena.action[i].copy()
-        arena.action[i] = actions[i]
-        for tick in range(hold):
-            outcome, clearance = fly_tick(arena, rules, i, tick == hold - 1, rng)
-            _tick_terms(arena, rules, i, clearance)
-            if outcome != RUNNING:
-                break
-        _end_terms(arena, rules, i, previous, outcome)
-        if outcome == TIME_OUT and hold > 1:
-            scan_into(arena, rules, i, rng)
-        observe_into(arena, rules, i, observations[i])
-        arena.outcome[i] = outcome
-        total = 0.0
-        for k in range(arena.terms.shape[1]):
-            arena.terms[i, k] *= rules.scale
-            total += arena.terms[i, k]
-        rewards[i] = total
+@njit(cache=False)
+def _decide(arena: Arena, rules: Rules, i: int, action: F64, hold: int, rng: np.random.Generator) -> int:
+    """One decision of one environment; returns the outcome and leaves the unscaled terms in `arena.terms`."""
+    arena.terms[i] = 0.0
+    outcome = RUNNING
+    previous = arena.action[i].copy()
+    arena.action[i] = action
+    for tick in range(hold):
+        outcome, clearance = fly_tick(arena, rules, i, tick == hold - 1, rng)
+        _tick_terms(arena, rules, i, clearance)
+        if outcome != RUNNING:
+            break
+    if outcome == TIME_OUT and tick < hold - 1:
+        scan_into(arena, rules, i, rng)  # the value of the state the episode is cut at needs a fresh scan
+    _end_terms(arena, rules, i, previous, outcome)
+    return outcome
 
 
-@njit(cache=True)
-def begin_episode(arena: Arena, rules: Rules, i: int, rng: np.random.Generator, observation: NDArray[np.float32]) -> None:
+@njit(cache=False)
+def _begin(arena: Arena, rules: Rules, i: int, rng: np.random.Generator, observation: NDArray[np.float32]) -> None:
     """First scan, estimate and observation of an episode whose rows have been filled."""
     arena.ticks[i] = 0
     arena.outcome[i] = RUNNING
@@ -306,7 +301,52 @@ def begin_episode(arena: Arena, rules: Rules, i: int, rng: np.random.Generator, 
     arena.episode[i, DISTANCE] = _distance(arena.vehicle[i, 0:3], arena.goal[i])
     arena.episode[i, MIN_CLEARANCE] = np.inf
     arena.episode[i, PATH_LENGTH] = 0.0
+    arena.episode[i, LAST_VELOCITY : LAST_VELOCITY + 3] = arena.vehicle[i, 3:6]
     _move_boxes(arena, i, 0.0)
     scan_into(arena, rules, i, rng)
     estimate_into(arena, i, False, rng)
     observe_into(arena, rules, i, observation)
+
+
+def _compile(stamp: str) -> tuple[Any, Any]:
+    """The two entry points; compiled anew when a source they build on changes (see sim_gateway.kernel_stamp)."""
+
+    @njit(cache=True)
+    def step(  # type: ignore[no-untyped-def]
+        arena, rules, actions, hold, rng, observations, rewards
+    ):
+        stamp  # noqa: B018  (closing over it puts it into the cache key)
+        for i in range(actions.shape[0]):
+            if not arena.active[i]:
+                continue
+            arena.outcome[i] = _decide(arena, rules, i, actions[i], hold, rng)
+            observe_into(arena, rules, i, observations[i])
+            rewards[i] = 0.0
+            for k in range(arena.terms.shape[1]):
+                arena.terms[i, k] *= rules.scale
+                rewards[i] += arena.terms[i, k]
+
+    @njit(cache=True)
+    def begin(arena, rules, i, rng, observation):  # type: ignore[no-untyped-def]
+        stamp  # noqa: B018
+        _begin(arena, rules, i, rng, observation)
+
+    return step, begin
+
+
+_step, _begin_compiled = _compile(source_stamp("vehicle", "vehicle_params", "collision", "estimate", "raycast", "scene"))
+
+
+def step_all(
+    arena: Arena, rules: Rules, actions: F64, hold: int, rng: np.random.Generator, observations: NDArray[np.float32], rewards: F64
+) -> None:
+    """One decision of all active environments: fly `hold` ticks, then scan, observe [N, 190] and reward [N].
+
+    `actions` [N, 4] are in SI units within the limits. Also writes `arena.outcome` and `arena.terms`.
+    """
+    _step(arena, rules, actions, hold, rng, observations, rewards)
+
+
+def begin_episode(arena: Arena, rules: Rules, i: int, rng: np.random.Generator, observation: NDArray[np.float32]) -> None:
+    """First scan, estimate and observation of an episode whose rows have been filled."""
+    _begin_compiled(arena, rules, i, rng, observation)

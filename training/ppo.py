@@ -33,7 +33,7 @@ class TrainingDivergedError(RuntimeError):
 
 def correlated_log_prob(raw: Tensor, mean: Tensor, log_std: Tensor, noise_before: Tensor, rho: Tensor | float) -> Tensor:
     """Log-density [...] of raw actions [..., 4] given the noise before [..., 4] (standard units) and its correlation."""
-    rho = torch.as_tensor(rho, dtype=raw.dtype)
+    rho = torch.as_tensor(rho, dtype=raw.dtype, device=raw.device)
     std = log_std.exp()
     log_scale = log_std + 0.5 * torch.log1p(-rho * rho)
     z = (raw - mean - std * rho * noise_before) / log_scale.exp()
@@ -83,10 +83,8 @@ class Batch:
     noise_before: Tensor
     rho: Tensor
     log_prob: Tensor
-    mean: Tensor
     advantage: Tensor
     target: Tensor
-    value: Tensor
     reset: Tensor
     h0: Tensor
     c0: Tensor
@@ -123,7 +121,7 @@ class PpoLearner:
         count = 0
         for _ in range(self.config.epochs):
             kls = []
-            for index in self._minibatches(batch.reset.shape[1], generator):
+            for index in self._minibatches(batch.reset, generator):
                 metrics = self._step(batch.select(index), progress)
                 kls.append(metrics["kl"])
                 for name, value in metrics.items():
@@ -135,14 +133,14 @@ class PpoLearner:
         self._adapt(kl, progress)
         return {name: value / count for name, value in sums.items()} | {"learning_rate": self.learning_rate}
 
-    def _minibatches(self, environments: int, generator: torch.Generator) -> Iterator[Tensor]:
-        order = torch.randperm(environments, generator=generator)
+    def _minibatches(self, reset: Tensor, generator: torch.Generator) -> Iterator[Tensor]:
+        order = torch.randperm(reset.shape[1], generator=generator).to(reset.device)
         yield from order.chunk(self.config.minibatches)
 
     def _step(self, batch: Batch, progress: float) -> dict[str, float]:
         loss, metrics = self._loss(batch, progress)
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        torch.autograd.backward(loss)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.max_grad_norm)
         if not torch.isfinite(loss) or not torch.isfinite(norm):
             raise TrainingDivergedError(

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from policy_export.network import PolicyNetwork
@@ -32,23 +33,27 @@ class RolloutCollector:
     def __init__(self, env: CorridorVectorEnv, network: PolicyNetwork, config: PpoConfig, generator: torch.Generator) -> None:
         self.env, self.network, self.config, self.generator = env, network, config, generator
         count = env.num_envs
+        self.device = network.log_std.device
         observations, _ = env.reset()
-        self.observation = torch.from_numpy(observations.copy())
-        self.reset = torch.ones(count, dtype=torch.bool)
+        self.observation = self._tensor(observations)
+        self.reset = torch.ones(count, dtype=torch.bool, device=self.device)
         self.h, self.c = network.initial_state(count)
         self.noise = self._fresh_noise()
 
     def state(self) -> dict[str, Any]:
         """Everything needed to go on exactly here (the environment keeps its own state)."""
-        return {name: getattr(self, name).clone() for name in ("observation", "reset", "h", "c", "noise")}
+        return {name: getattr(self, name).cpu().clone() for name in ("observation", "reset", "h", "c", "noise")}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of ``state``."""
         for name in ("observation", "reset", "h", "c", "noise"):
-            setattr(self, name, state[name].clone())
+            setattr(self, name, state[name].clone().to(self.device))
 
     def _fresh_noise(self) -> Tensor:
-        return torch.randn(self.env.num_envs, 4, generator=self.generator)
+        return torch.randn(self.env.num_envs, 4, generator=self.generator).to(self.device)
+
+    def _tensor(self, array: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(array).to(self.device)
 
     @torch.no_grad()
     def collect(self, hold: int) -> tuple[Batch, RolloutSummary]:
@@ -58,11 +63,12 @@ class RolloutCollector:
         h0, c0 = (self.h[0].clone(), self.c[0].clone())
         rows: list[dict[str, Tensor]] = [self._decide(hold, rho, summary) for _ in range(steps)]
         stacked = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
-        last_value = self._value(self.observation, torch.arange(self.env.num_envs), keep_reset=True)
+        values = stacked.pop("value")
+        last_value = self._value(self.observation, torch.arange(self.env.num_envs, device=self.device), keep_reset=True)
         decay = (self.config.gamma_per_tick**hold, self.config.gae_lambda)
         advantage, target = advantages(
             stacked.pop("reward"),
-            stacked["value"],
+            values,
             last_value,
             stacked.pop("terminated"),
             stacked.pop("truncated"),
@@ -78,19 +84,18 @@ class RolloutCollector:
         keep = (~self.reset).float().unsqueeze(-1)
         mean, value = self._forward(features, keep)
         noise_before = self.noise
-        correlation = torch.full((self.env.num_envs, 1), rho)
+        correlation = torch.full((self.env.num_envs, 1), rho, device=self.device)
         self.noise = rho * noise_before + math.sqrt(1.0 - rho * rho) * self._fresh_noise()
         raw = mean + network.log_std.exp() * self.noise
         log_prob = correlated_log_prob(raw, mean, network.log_std, noise_before, correlation)
         action = network.action(raw)
-        observation, reward, terminated, truncated, info = self.env.step_held(action.numpy(), hold)
-        row = {
-            "features": features, "raw": raw, "noise_before": noise_before, "rho": correlation[:, 0], "log_prob": log_prob, "mean": mean,
-            "value": value, "reset": self.reset, "reward": torch.from_numpy(reward.astype(np.float32)),
-            "terminated": torch.from_numpy(terminated.copy()), "truncated": torch.from_numpy(truncated.copy()),
-        }  # fmt: skip
+        observation, reward, terminated, truncated, info = self.env.step_held(action.cpu().numpy(), hold)
+        row = {"features": features, "raw": raw, "noise_before": noise_before, "rho": correlation[:, 0], "log_prob": log_prob}
+        row |= {"value": value, "reset": self.reset}
+        row |= {"reward": self._tensor(reward.astype(np.float32)), "terminated": self._tensor(terminated)}
+        row["truncated"] = self._tensor(truncated)
         row["final_value"] = self._final_values(row["truncated"], info)
-        self.observation = torch.from_numpy(observation.copy())
+        self.observation = self._tensor(observation)
         self.reset = row["terminated"] | row["truncated"]
         self.noise = torch.where(self.reset.unsqueeze(-1), self._fresh_noise(), self.noise)
         _summarise(summary, info, self.env.num_envs)
@@ -114,10 +119,10 @@ class RolloutCollector:
 
     def _final_values(self, truncated: Tensor, info: dict[str, Any]) -> Tensor:
         """Value of the observation an episode was cut at by its time limit, [B]; zero elsewhere."""
-        result = torch.zeros(self.env.num_envs)
+        result = torch.zeros(self.env.num_envs, device=self.device)
         index = truncated.nonzero()[:, 0]
         if len(index):
-            final = torch.from_numpy(info["final_obs"][index.numpy()].copy())
+            final = self._tensor(info["final_obs"][index.cpu().numpy()])
             result[index] = self._value(final, index, keep_reset=False)
         return result
 

@@ -90,7 +90,7 @@ class Trainer:
     def updates(self) -> Iterator[Status]:
         """Train until ``config.decisions`` are done. Raises TrainingDivergedError with the last checkpoint intact."""
         self.out.mkdir(parents=True, exist_ok=True)
-        with _Recorder(self.out) as recorder:
+        with _Recorder(self.out, self.decisions) as recorder:
             while self.decisions < self.config.decisions:
                 status = self._one_update()
                 recorder.write(self, status)
@@ -139,20 +139,15 @@ class Trainer:
 
     def save(self, name: str) -> None:
         """Write a checkpoint that both the exporter and ``resume`` read."""
-        training = {
-            "config_hash": self.config.digest(), "seed": self.config.seed, "steps": self.decisions, "git_commit": git_commit(),
-            "updates": self.update_count, "seconds": round(self.seconds, 1), "evaluation": self.evaluation or {},
-        }  # fmt: skip
-        resume = {
-            "config": self.config.model_dump(mode="json"), "best": self.best, "next_evaluation": self.next_evaluation,
-            "seconds": self.seconds, "learning_rate": self.learner.learning_rate, "generator": self.generator.get_state(),
-            "collector": self.collector.state(), "environment": self.env.state(), "recent": list(self._recent),
-        }  # fmt: skip
-        content = {
-            "network_config": self.network.config.to_dict(), "state_dict": self.network.state_dict(), "training": training,
-            "layout": {"observation": self.layout.model_dump(mode="json"), "action": self.action_layout.model_dump(mode="json")},
-            "optimizer": self.learner.optimizer.state_dict(), "resume": resume,
-        }  # fmt: skip
+        config, learner, network = self.config, self.learner, self.network
+        training = {"config_hash": config.digest(), "seed": config.seed, "steps": self.decisions, "git_commit": git_commit()}
+        training |= {"updates": self.update_count, "seconds": round(self.seconds, 1), "evaluation": self.evaluation or {}}
+        resume = {"config": config.model_dump(mode="json"), "best": self.best, "next_evaluation": self.next_evaluation}
+        resume |= {"seconds": self.seconds, "learning_rate": learner.learning_rate, "generator": self.generator.get_state()}
+        resume |= {"collector": self.collector.state(), "environment": self.env.state(), "recent": list(self._recent)}
+        layout = {"observation": self.layout.model_dump(mode="json"), "action": self.action_layout.model_dump(mode="json")}
+        content = {"network_config": network.config.to_dict(), "state_dict": _on_cpu(network.state_dict()), "training": training}
+        content |= {"layout": layout, "optimizer": learner.optimizer.state_dict(), "resume": resume}
         save_checkpoint(self.out / name, to_plain(content))
 
     def resume(self, path: Path) -> None:
@@ -171,14 +166,34 @@ class Trainer:
         self._recent.extend(saved["recent"])
 
 
+def _on_cpu(weights: dict[str, Any]) -> dict[str, Any]:
+    return {name: tensor.cpu() for name, tensor in weights.items()}
+
+
+def _forget_after(path: Path, decisions: int) -> None:
+    """Drop the rows of updates that a resumed run will repeat, and a torn last line."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            if json.loads(line)["decisions"] <= decisions:
+                kept.append(line + "\n")
+        except ValueError:
+            continue
+    path.write_text("".join(kept), encoding="utf-8")
+
+
 class _Recorder:
     """Metrics of every update to ``metrics.jsonl`` and TensorBoard."""
 
-    def __init__(self, out: Path) -> None:
+    def __init__(self, out: Path, decisions: int) -> None:
         from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  # slow import
 
-        self._file = (out / "metrics.jsonl").open("a", encoding="utf-8")
-        self._board = SummaryWriter(str(out / "tensorboard"))
+        path = out / "metrics.jsonl"
+        _forget_after(path, decisions)
+        self._file = path.open("a", encoding="utf-8")
+        self._board = SummaryWriter(str(out / "tensorboard"), purge_step=decisions + 1)
 
     def __enter__(self) -> _Recorder:
         return self
@@ -190,9 +205,12 @@ class _Recorder:
     def write(self, trainer: Trainer, status: Status) -> None:
         """One line, one TensorBoard step."""
         row: dict[str, Any] = {
-            "decisions": status.decisions, "update": trainer.update_count, "seconds": round(trainer.seconds, 2), "hold": status.hold,
-            "decisions_per_s": round(status.decisions_per_s, 1), "success": status.success, "contacts": status.contacts, **status.metrics,
-        }  # fmt: skip
+            "decisions": status.decisions,
+            "update": trainer.update_count,
+            "seconds": round(trainer.seconds, 2),
+        }
+        row |= {"hold": status.hold, "decisions_per_s": round(status.decisions_per_s, 1)}
+        row |= {"success": status.success, "contacts": status.contacts} | status.metrics
         for name, value in row.items():
             self._board.add_scalar(name, value, status.decisions)
         if status.evaluation is not None:
