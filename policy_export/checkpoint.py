@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import struct
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,22 @@ from policy_export.network import NetworkConfig, PolicyNetwork
 
 MAX_CHECKPOINT_BYTES = 512 * 1024 * 1024
 _NEEDED = ("network_config", "state_dict", "training", "layout")
+# What torch's restricted unpickler raises on damaged files, seen by cutting and flipping bytes.
+_UNREADABLE = (
+    OSError,
+    RuntimeError,
+    ValueError,
+    EOFError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    AssertionError,
+    OverflowError,
+    MemoryError,
+    struct.error,
+    zipfile.BadZipFile,
+    pickle.UnpicklingError,
+)
 _MOTION_ORDERS = {
     ("lidar", "goal_offset", "velocity", "acceleration", "yaw"),
     ("lidar", "position", "velocity", "acceleration", "yaw"),
@@ -94,7 +111,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path}: larger than {MAX_CHECKPOINT_BYTES} bytes")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, ValueError, EOFError, KeyError, zipfile.BadZipFile, pickle.UnpicklingError) as error:
+    except _UNREADABLE as error:
         raise CheckpointError(f"{path}: not a readable checkpoint ({type(error).__name__})") from None
     if not isinstance(content, dict):
         raise CheckpointError(f"{path}: not a checkpoint written by train-policy")
