@@ -8,6 +8,8 @@ from safety.config import SafetyConfig, speed_cap_m_s
 from safety.frames import CorridorVector
 from safety.messages import Intervention, VelocityCommand
 
+ROUNDING_M_S = 1e-9  # the time between two ticks is a difference of large numbers
+
 
 def limit_command(
     command: VelocityCommand, last: CorridorVector, dt_s: float, range_max_m: float, config: SafetyConfig
@@ -53,7 +55,7 @@ def _limit_acceleration(
     bx, by, bz = last.x * keep, last.y * keep, last.z * keep
     dx, dy, dz = velocity.x - bx, velocity.y - by, velocity.z - bz
     step, limit = math.sqrt(dx * dx + dy * dy + dz * dz), config.max_acceleration_m_s2 * dt_s
-    if step <= limit:
+    if step <= limit + ROUNDING_M_S:
         return velocity
     found.append(Intervention("acceleration_limit", step, limit))
     share = limit / step

@@ -109,13 +109,13 @@ class InputMonitor:
     def _content_fault(self, scan: LidarScan) -> Intervention | None:
         """Whole-scan failures: mostly NaN (L6), mostly touching (L5), suddenly empty although walls were near (L4)."""
         ranges, beams = scan.ranges_m, scan.ranges_m.shape[0]
-        unknown = np.count_nonzero(np.isnan(ranges)) / beams
+        unknown = int(np.count_nonzero(np.isnan(ranges))) / beams
         if unknown > MOST_BEAMS:
             return Intervention("scan_unknown", unknown, MOST_BEAMS)
-        touching = np.count_nonzero(ranges < scan.range_min_m) / beams
+        touching = int(np.count_nonzero(ranges < scan.range_min_m)) / beams
         if touching > MOST_BEAMS:
             return Intervention("scan_touching", touching, MOST_BEAMS)
-        near = np.count_nonzero(ranges < WALL_RANGE * scan.range_max_m) / beams
+        near = int(np.count_nonzero(ranges < WALL_RANGE * scan.range_max_m)) / beams
         if self._walled and near == 0.0 and bool(np.all(ranges >= scan.range_max_m)):
             return Intervention("scan_blank", near, WALL_SHARE)
         self._walled = near >= WALL_SHARE

@@ -4,6 +4,7 @@ A command passes when its brake tube (safety.braking) is nowhere nearer to a kno
 fence, than allowed. Allowed is the keep-out distance, or, where even braking cannot hold it (bad start, drift, an obstacle that
 appears), what braking reaches, judged point by point: no violation may grow, and every way out of it stays open. So that a
 vehicle just inside the margin can slide along a wall, points that braking keeps clear of may be neared to half the margin then.
+Where even braking would bring the hull onto a point, no command may have any part towards it.
 """
 
 from __future__ import annotations
@@ -132,10 +133,12 @@ class Shield:
         """Judge the wanted command (row 0) against the allowance that braking (row 1) sets."""
         tube = tubes(around.start, first, self._config)
         clear, fence = self._tube_clearances(tube, around), self._tube_fence(tube)
-        allowed = _Allowed(self._allowed_clearances(clear[1]), np.minimum(0.0, fence[1]), tube.stop_m[:, 1])
+        hit = clear[1] < -self._config.margin_m
+        towards = np.stack((around.x_m[hit] - around.position.x, around.y_m[hit] - around.position.y))
+        allowed = _Allowed(self._allowed_clearances(clear[1]), towards, np.minimum(0.0, fence[1]), tube.stop_m[:, 1])
         short = clear[0] - allowed.clearance_m
         worst = int(np.argmin(short)) if short.shape[0] else -1
-        obstacle_ok = worst < 0 or float(short[worst]) >= -EPSILON_M
+        obstacle_ok = worst < 0 or (float(short[worst]) >= -EPSILON_M and bool(allowed.retreats(first[:1])[0]))
         face = int(np.argmin(fence[0] - allowed.fence_m))
         fence_ok = float(fence[0, face]) >= float(allowed.fence_m[face]) - EPSILON_M
         if not fence_ok:
@@ -160,7 +163,7 @@ class Shield:
         tube = tubes(around.start, candidates, self._config)
         fence_ok = (self._tube_fence(tube) >= allowed.fence_m - EPSILON_M).all(axis=1)
         clear_ok = (self._tube_clearances(tube, around) >= allowed.clearance_m - EPSILON_M).all(axis=1)
-        passed: NDArray[np.bool_] = np.logical_and(fence_ok, clear_ok)
+        passed: NDArray[np.bool_] = fence_ok & clear_ok & allowed.retreats(candidates)
         away = candidates - wanted
         cost = np.where(passed, np.einsum("ci,ci->c", away, away), math.inf)
         best = int(np.argmin(cost))
@@ -207,11 +210,22 @@ class Shield:
 
 @dataclass(frozen=True, slots=True)
 class _Allowed:
-    """How far a tube may violate clearance to each point [k] (<= 0) and fence faces [6] (<= 0); brake's stop [2 models, 3]."""
+    """What a command may do at most, given what braking does.
+
+    `clearance_m` [k], `fence_m` [6]: how far a tube may violate the clearance to each point and each face of the fence (<= 0).
+    `towards_m` [2, h]: from the vehicle to the points that braking hits. `stop_m` [2 models, 3]: where braking ends.
+    """
 
     clearance_m: Floats
+    towards_m: Floats
     fence_m: Floats
     stop_m: Floats
+
+    def retreats(self, candidates: Floats) -> NDArray[np.bool_]:
+        """Which commands [c, 3] have no part towards any point that braking would hit."""
+        part = candidates[:, :1] * self.towards_m[0] + candidates[:, 1:2] * self.towards_m[1]
+        retreating: NDArray[np.bool_] = (part <= EPSILON_M).all(axis=1)
+        return retreating
 
 
 def _leg_clearances(begin_m: Floats, end_m: Floats, error_begin_m: float, error_end_m: float, around: Surroundings) -> Floats:

@@ -1,0 +1,232 @@
+"""What counts as free, as obstacle and as unknown; what is remembered and for how long."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safety_plant import config, scan, state
+
+from safety.lidar import BeamTable, blind, clean_ranges, scan_problem, see
+from safety.memory import CAPACITY, ObstacleMemory
+from safety.messages import LidarScan
+
+C = config()
+
+
+def seen(ranges=None, pose=None, time_s=0.0, **kinds):
+    return see(scan(ranges, time_s=time_s, **kinds), pose or state(time_s=time_s), BeamTable(), C)
+
+
+def one_return(beam: int, range_m: float, beams: int = 180) -> np.ndarray:
+    ranges = np.full(beams, np.inf)
+    ranges[beam] = range_m
+    return ranges
+
+
+@pytest.mark.parametrize("value", [0.0, -0.0, -1.0, -np.inf, 0.05, 0.0999])
+def test_too_near_is_an_obstacle_at_the_vehicle(value):
+    """Edge 23: the closest beams are never dropped."""
+    assert clean_ranges(scan(one_return(90, value)))[90] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(("value", "kept"), [(65.535, False), (4.2, False), (4.05, True), (0.1, True), (4.0, True)])
+def test_beyond_the_sensor_is_unknown_never_free(value, kept):
+    cleaned = clean_ranges(scan(one_return(90, value)))[90]
+    assert cleaned == pytest.approx(value) if kept else math.isnan(cleaned)
+
+
+def test_infinity_is_free_and_nan_unknown():
+    found = seen(one_return(90, np.nan))
+    assert math.isnan(found.range_m[90])
+    assert np.isinf(found.range_m[89])
+    assert found.x_m.shape == (0,)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        lambda s: LidarScan(0.0, s.ranges_m.reshape(2, 90), *rest(s)),
+        lambda s: LidarScan(0.0, s.ranges_m[:1], *rest(s)),
+        lambda s: LidarScan(0.0, np.ones(5000, dtype=np.float32), *rest(s)),
+        lambda s: LidarScan(0.0, s.ranges_m.astype(np.int32, casting="unsafe"), *rest(s)),
+        lambda s: LidarScan(0.0, list(s.ranges_m), *rest(s)),
+        lambda s: LidarScan(0.0, s.ranges_m, s.angle_min_rad, 0.0, 0.1, 4.0),
+        lambda s: LidarScan(0.0, s.ranges_m, s.angle_min_rad, -s.angle_increment_rad, 0.1, 4.0),
+        lambda s: LidarScan(0.0, s.ranges_m, s.angle_min_rad, 0.1, 0.1, 4.0),
+        lambda s: LidarScan(0.0, s.ranges_m, s.angle_min_rad, s.angle_increment_rad, 4.0, 4.0),
+        lambda s: LidarScan(0.0, s.ranges_m, s.angle_min_rad, s.angle_increment_rad, -0.1, 4.0),
+        lambda s: LidarScan(0.0, s.ranges_m, math.nan, s.angle_increment_rad, 0.1, 4.0),
+        lambda s: LidarScan(0.0, s.ranges_m, s.angle_min_rad, s.angle_increment_rad, 0.1, math.inf),
+    ],
+)
+def test_malformed_scans_are_named(bad):
+    with np.errstate(invalid="ignore"):
+        assert str(scan_problem(bad(scan()))).startswith("scan_")
+
+
+def rest(s):
+    return s.angle_min_rad, s.angle_increment_rad, s.range_min_m, s.range_max_m
+
+
+def test_good_scan_has_no_problem():
+    assert scan_problem(scan()) is None
+    assert scan_problem(scan(beams=360, fov=2 * math.pi)) is None
+
+
+@pytest.mark.parametrize(("beam", "side"), [(0, -1), (179, 1)])
+def test_first_beam_is_right_last_is_left(beam, side):
+    """Edge 25: the order of the beams decides left and right."""
+    found = seen(one_return(beam, 2.0))
+    assert found.y_m[0] * side == pytest.approx(2.0, abs=0.01)
+
+
+@given(st.floats(-math.pi, math.pi), st.integers(0, 179), st.floats(0.2, 3.9))
+def test_point_lies_where_the_beam_points(yaw, beam, range_m):
+    found = seen(one_return(beam, range_m), state(x=3.0, y=-1.0, yaw=yaw))
+    bearing = yaw - math.pi / 2 + math.pi / 180 * (beam + 0.5)
+    assert found.x_m[0] == pytest.approx(3.0 + range_m * math.cos(bearing), abs=1e-5)
+    assert found.y_m[0] == pytest.approx(-1.0 + range_m * math.sin(bearing), abs=1e-5)
+
+
+@given(st.floats(-1.0, 1.0), st.floats(-0.5, 0.5), st.floats(-1.0, 1.0), st.floats(0.0, 0.2))
+def test_own_motion_between_scan_and_estimate_is_taken_out(vx, vy, rate, age):
+    """A wall point ahead of the pose at scan time, seen from a state `age` later."""
+    pose = state(x=5 + vx * age, y=vy * age, v=(vx, vy, 0.0), yaw=rate * age, yaw_rate=rate, time_s=age)
+    found = see(scan(one_return(89, 2.0), time_s=0.0), pose, BeamTable(), C)
+    assert (found.x_m[0], found.y_m[0]) == pytest.approx((5 + 2.0, 2.0 * math.sin(-math.pi / 360)), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("roll", "pitch", "beam", "low"), [(0, -0.3, 90, True), (0, 0.3, 90, False), (0.3, 0, 0, True), (0.3, 0, 179, False)]
+)
+def test_tilted_beam_that_meets_the_ground_is_unknown(roll, pitch, beam, low):
+    """Nose down looks at the ground ahead; right side down looks at it on the right."""
+    found = seen(one_return(beam, 3.0), state(z=1.0, roll=roll, pitch=pitch))
+    assert math.isnan(found.range_m[beam]) == low
+    assert found.x_m.shape[0] == (0 if low else 1)
+
+
+def test_tilt_shortens_the_horizontal_distance():
+    found = seen(one_return(90, 2.0), state(z=3.0, pitch=-0.3))
+    assert found.x_m[0] - 5.0 == pytest.approx(2.0 * math.cos(0.3), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("direction_deg", "unseen"), [(0, False), (80, False), (-80, False), (88, True), (-88, True), (180, True), (135, True)]
+)
+def test_directions_outside_the_view_are_blind(direction_deg, unseen):
+    assert bool(blind(seen(), np.array([math.radians(direction_deg)]), 0.0, C)[0]) == unseen
+
+
+def test_view_turns_with_the_vehicle_and_wraps():
+    for turns in (-2, 0, 3):
+        yaw = math.pi + 2 * math.pi * turns
+        assert not blind(seen(pose=state(yaw=yaw)), np.array([math.pi]), yaw, C)[0]
+        assert blind(seen(pose=state(yaw=yaw)), np.array([0.0]), yaw, C)[0]
+
+
+def test_all_round_scan_has_no_blind_side():
+    found = seen(beams=360, fov=2 * math.pi)
+    assert not blind(found, np.linspace(-math.pi, math.pi, 50), 0.3, C).any()
+
+
+def test_unknown_sector_is_blind_but_one_lost_beam_is_not():
+    ranges = np.full(180, np.inf)
+    ranges[90] = np.nan
+    assert not blind(seen(ranges), np.array([0.0]), 0.0, C)[0]
+    ranges[80:100] = np.nan
+    assert blind(seen(ranges), np.array([0.0]), 0.0, C)[0]
+    assert not blind(seen(ranges), np.array([1.0]), 0.0, C)[0]
+
+
+def fed(memory, ranges, time_s, pose=None):
+    memory.update(seen(ranges, pose, time_s), 5.0, C)
+    return memory.points(time_s, C)
+
+
+def test_new_return_replaces_the_old_one():
+    memory = ObstacleMemory()
+    for k, range_m in enumerate((2.0, 1.95, 1.9)):
+        x, _, _ = fed(memory, one_return(90, range_m), 0.05 * k)
+    assert x.shape == (1,)
+    assert x[0] == pytest.approx(6.9, abs=0.01)
+
+
+def test_drop_out_is_bridged_but_a_gone_obstacle_is_forgotten():
+    """L13, L14: one scan that looks past a return does not remove it; three do."""
+    memory = ObstacleMemory()
+    fed(memory, one_return(90, 2.0), 0.0)
+    assert fed(memory, None, 0.05)[0].shape == (1,)
+    assert fed(memory, None, 0.10)[0].shape == (1,)
+    assert fed(memory, None, 0.15)[0].shape == (0,)
+
+
+def test_what_leaves_the_view_is_remembered_for_its_time():
+    memory = ObstacleMemory()
+    fed(memory, one_return(90, 2.0), 0.0)
+    away = state(yaw=math.pi)
+    assert fed(memory, None, 1.0, away)[0].shape == (1,)
+    assert fed(memory, None, C.memory_s - 0.1, away)[0].shape == (1,)
+    assert fed(memory, None, C.memory_s + 0.1, away)[0].shape == (0,)
+
+
+def test_hidden_behind_something_nearer_stays():
+    memory = ObstacleMemory()
+    fed(memory, one_return(90, 3.0), 0.0)
+    x, _, _ = fed(memory, one_return(90, 1.0), 1.0)
+    assert sorted(np.round(x - 5.0, 1)) == [1.0, 3.0]
+
+
+def test_unknown_beam_forgets_nothing():
+    memory = ObstacleMemory()
+    fed(memory, one_return(90, 2.0), 0.0)
+    assert fed(memory, one_return(90, np.nan), 1.0)[0].shape == (1,)
+
+
+def test_far_points_are_dropped():
+    memory = ObstacleMemory()
+    fed(memory, one_return(90, 3.0), 0.0)
+    memory.update(seen(None, state(x=-5.0), 0.05), 5.0, C)
+    assert memory.count == 0
+
+
+def test_age_widens_a_point_up_to_its_bounds():
+    memory = ObstacleMemory()
+    fed(memory, one_return(90, 2.0), 0.0)
+    spread = 2.0 * 0.5 * math.pi / 180
+    assert memory.points(0.0, C)[2][0] == pytest.approx(spread)
+    assert memory.points(0.5, C)[2][0] == pytest.approx(spread + 0.5 * C.velocity_error_m_s)
+    assert memory.points(10.0, C)[2][0] == pytest.approx(spread + C.position_error_m)
+    assert memory.points(1.0, config(obstacle_speed_m_s=0.5))[2][0] == pytest.approx(spread + 0.05 + 0.5)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_memory_never_grows_and_the_newest_scan_is_always_in(seed):
+    random, memory = np.random.default_rng(seed), ObstacleMemory()
+    for k in range(60):
+        ranges = random.uniform(0.2, 4.5, 180)
+        pose = state(x=random.uniform(4, 6), yaw=random.uniform(-3, 3), time_s=0.05 * k)
+        now = seen(ranges, pose, 0.05 * k)
+        memory.update(now, 5.0, C)
+        assert memory.count <= CAPACITY
+        x, y, _ = memory.points(0.05 * k, C)
+        assert np.array_equal(x[-now.x_m.shape[0] :], now.x_m)
+        assert np.array_equal(y[-now.y_m.shape[0] :], now.y_m)
+
+
+def test_full_memory_lets_the_oldest_go():
+    """Rings, each hidden behind the next nearer one, so that none is looked at again: the first seen go first."""
+    memory, rings = ObstacleMemory(), [3.8 - 0.3 * k for k in range(8)]
+    for k, radius in enumerate(rings):
+        memory.update(seen(np.full(360, radius), None, 0.05 * k, fov=2 * math.pi), 50.0, C)
+        assert memory.count <= CAPACITY
+    x, y, _ = memory.points(0.4, C)
+    counts = [int(np.count_nonzero(np.abs(np.hypot(x - 5.0, y) - radius) < 1e-6)) for radius in rings]
+    assert counts == [0, 0, CAPACITY - 5 * 360, 360, 360, 360, 360, 360]
+    memory.clear()
+    assert memory.count == 0
