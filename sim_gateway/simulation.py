@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -34,7 +33,6 @@ from sim_gateway.estimate import (
     initial_error,
     step_error,
 )
-from sim_gateway.kernel_stamp import source_stamp
 from sim_gateway.lidar import Lidar, LidarConfig
 from sim_gateway.scene import Boxes, Point, World, place_movers
 from sim_gateway.vehicle import (
@@ -108,34 +106,6 @@ class Scan:
     range_max_m: float
 
 
-def _compile_advance(stamp: str) -> Any:
-    """The stepping kernel; compiled anew when a source it builds on changes (see `kernel_stamp`)."""
-
-    @njit(cache=True)
-    def advance(  # type: ignore[no-untyped-def]
-        state, params, velocity_sp, yaw_rate_sp, motors_on, normals, first_step,
-        boxes, fixed, movers, error, coefficients, wind_mean, gust, gust_coefficients, radius, log,
-    ):  # fmt: skip
-        stamp  # noqa: B018  (closing over it puts it into the cache key)
-        wind = np.empty(3)
-        for step in range(normals.shape[0]):
-            for i in range(3):
-                gust[i] = gust_coefficients[0] * gust[i] + gust_coefficients[1] * normals[step, PROCESSES + i]
-                wind[i] = wind_mean[i] + gust[i]
-            step_error(error, coefficients, normals[step])
-            x, y, z = state[POS], state[POS + 1], state[POS + 2]
-            if motors_on:
-                step_velocity(state, params, velocity_sp, yaw_rate_sp, wind, error[VELOCITY_ERROR : VELOCITY_ERROR + 3], 1)
-            else:
-                step_motors_off(state, params, wind, 1)
-            dx, dy, dz = state[POS] - x, state[POS + 1] - y, state[POS + 2] - z
-            log[_FLOWN] += math.sqrt(dx * dx + dy * dy + dz * dz)
-            place_movers(movers, movers.shape[0], (first_step + step + 1) * STEP_S, boxes[fixed:])
-            _watch_clearance(boxes, state, radius, log)
-
-    return advance
-
-
 @njit(cache=True)
 def _watch_clearance(boxes: Array, state: Array, radius: float, log: Array) -> None:
     """Keep the least clearance, and count a contact whenever clearance falls below zero."""
@@ -147,7 +117,27 @@ def _watch_clearance(boxes: Array, state: Array, radius: float, log: Array) -> N
     log[_TOUCHING] = touching
 
 
-_advance = _compile_advance(source_stamp("simulation", "vehicle", "vehicle_params", "estimate", "scene", "collision"))
+@njit(cache=True)
+def _advance(  # type: ignore[no-untyped-def]
+    state, params, velocity_sp, yaw_rate_sp, motors_on, normals, first_step,
+    boxes, fixed, movers, error, coefficients, wind_mean, gust, gust_coefficients, radius, log,
+):  # fmt: skip
+    """`normals.shape[0]` steps of 4 ms: wind, estimate errors, vehicle, movers, then clearance and contacts into `log`."""
+    wind = np.empty(3)
+    for step in range(normals.shape[0]):
+        for i in range(3):
+            gust[i] = gust_coefficients[0] * gust[i] + gust_coefficients[1] * normals[step, PROCESSES + i]
+            wind[i] = wind_mean[i] + gust[i]
+        step_error(error, coefficients, normals[step])
+        x, y, z = state[POS], state[POS + 1], state[POS + 2]
+        if motors_on:
+            step_velocity(state, params, velocity_sp, yaw_rate_sp, wind, error[VELOCITY_ERROR : VELOCITY_ERROR + 3], 1)
+        else:
+            step_motors_off(state, params, wind, 1)
+        dx, dy, dz = state[POS] - x, state[POS + 1] - y, state[POS + 2] - z
+        log[_FLOWN] += math.sqrt(dx * dx + dy * dy + dz * dz)
+        place_movers(movers, movers.shape[0], (first_step + step + 1) * STEP_S, boxes[fixed:])
+        _watch_clearance(boxes, state, radius, log)
 
 
 def step_at(time_s: float) -> int:

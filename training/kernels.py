@@ -7,7 +7,7 @@ environments is one call. Frames: corridor (x along, y left, z up) unless a name
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -24,7 +24,6 @@ from sim_gateway.estimate import (
     VELOCITY_ERROR,
     step_error,
 )
-from sim_gateway.kernel_stamp import source_stamp
 from sim_gateway.raycast import cast_beams
 from sim_gateway.scene import place_movers
 
@@ -108,12 +107,12 @@ class Arena(NamedTuple):
     active: NDArray[np.bool_]
 
 
-@njit(cache=False)
+@njit(cache=True)
 def _distance(a: F64, b: F64) -> float:
     return math.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
-@njit(cache=False)
+@njit(cache=True)
 def scan_into(arena: Arena, rules: Rules, i: int, rng: np.random.Generator) -> None:
     """Cast, disturb and clip one scan as the observation wants it: no return is the maximum range, too near is 0."""
     boxes, state = arena.boxes[i], arena.vehicle[i]
@@ -130,7 +129,7 @@ def scan_into(arena: Arena, rules: Rules, i: int, rng: np.random.Generator) -> N
             out[k] = 0.0 if value < rules.range_min_m else value
 
 
-@njit(cache=False)
+@njit(cache=True)
 def estimate_into(arena: Arena, i: int, advance: bool, rng: np.random.Generator) -> None:
     """Write the estimate the flight stack would see; with `advance` its errors first move on by one tick."""
     state, error, out = arena.vehicle[i], arena.errors[i], arena.estimate[i]
@@ -144,7 +143,7 @@ def estimate_into(arena: Arena, i: int, advance: bool, rng: np.random.Generator)
     out[9] = math.atan2(math.sin(yaw), math.cos(yaw))
 
 
-@njit(cache=False)
+@njit(cache=True)
 def observe_into(arena: Arena, rules: Rules, i: int, out: NDArray[np.float32]) -> None:
     """The observation as policy_export.observation builds it."""
     estimate, n = arena.estimate[i], arena.ranges.shape[1]
@@ -163,7 +162,7 @@ def observe_into(arena: Arena, rules: Rules, i: int, out: NDArray[np.float32]) -
     out[n + 9] = yaw
 
 
-@njit(cache=False)
+@njit(cache=True)
 def _new_command(arena: Arena, rules: Rules, i: int, out: F64) -> None:
     """Turn the action by the estimated yaw, as the flight loop does once per tick."""
     action = arena.action[i]
@@ -174,7 +173,7 @@ def _new_command(arena: Arena, rules: Rules, i: int, out: F64) -> None:
         out[1] = sin * action[0] + cos * action[1]
 
 
-@njit(cache=False)
+@njit(cache=True)
 def _judge(arena: Arena, rules: Rules, i: int) -> tuple[int, float]:
     """Outcome at this moment and the clearance (m)."""
     state = arena.vehicle[i]
@@ -190,14 +189,14 @@ def _judge(arena: Arena, rules: Rules, i: int) -> tuple[int, float]:
     return RUNNING, clearance
 
 
-@njit(cache=False)
+@njit(cache=True)
 def _move_boxes(arena: Arena, i: int, time_s: float) -> None:
     movers = arena.box_count[i, 1]
     if movers > 0:
         place_movers(arena.movers[i], movers, time_s, arena.boxes[i, arena.box_count[i, 0] :])
 
 
-@njit(cache=False)
+@njit(cache=True)
 def fly_tick(arena: Arena, rules: Rules, i: int, scan: bool, rng: np.random.Generator) -> tuple[int, float]:
     """One 50 ms tick of one environment: outcome and smallest clearance (m) seen. With `scan`, the LiDAR is read too."""
     state, params, wind = arena.vehicle[i], arena.params[i], arena.wind[i]
@@ -234,7 +233,7 @@ def fly_tick(arena: Arena, rules: Rules, i: int, scan: bool, rng: np.random.Gene
     return outcome, smallest
 
 
-@njit(cache=False)
+@njit(cache=True)
 def _tick_terms(arena: Arena, rules: Rules, i: int, clearance: float) -> None:
     """Add the terms that are paid per second for one tick."""
     terms, state, dt = arena.terms[i], arena.vehicle[i], TICK_S
@@ -254,7 +253,7 @@ def _tick_terms(arena: Arena, rules: Rules, i: int, clearance: float) -> None:
         terms[PATH_DEVIATION] += rules.path_deviation_per_m_s * off * dt
 
 
-@njit(cache=False)
+@njit(cache=True)
 def _end_terms(arena: Arena, rules: Rules, i: int, action: F64, outcome: int) -> None:
     """Add the terms that are paid once per decision."""
     terms = arena.terms[i]
@@ -273,7 +272,7 @@ def _end_terms(arena: Arena, rules: Rules, i: int, action: F64, outcome: int) ->
         terms[CONTACT_COST] += rules.contact
 
 
-@njit(cache=False)
+@njit(cache=True)
 def _decide(arena: Arena, rules: Rules, i: int, action: F64, hold: int, rng: np.random.Generator) -> int:
     """One decision of one environment; returns the outcome and leaves the unscaled terms in `arena.terms`."""
     arena.terms[i] = 0.0
@@ -291,8 +290,8 @@ def _decide(arena: Arena, rules: Rules, i: int, action: F64, hold: int, rng: np.
     return outcome
 
 
-@njit(cache=False)
-def _begin(arena: Arena, rules: Rules, i: int, rng: np.random.Generator, observation: NDArray[np.float32]) -> None:
+@njit(cache=True)
+def begin_episode(arena: Arena, rules: Rules, i: int, rng: np.random.Generator, observation: NDArray[np.float32]) -> None:
     """First scan, estimate and observation of an episode whose rows have been filled."""
     arena.ticks[i] = 0
     arena.outcome[i] = RUNNING
@@ -308,35 +307,7 @@ def _begin(arena: Arena, rules: Rules, i: int, rng: np.random.Generator, observa
     observe_into(arena, rules, i, observation)
 
 
-def _compile(stamp: str) -> tuple[Any, Any]:
-    """The two entry points; compiled anew when a source they build on changes (see sim_gateway.kernel_stamp)."""
-
-    @njit(cache=True)
-    def step(  # type: ignore[no-untyped-def]
-        arena, rules, actions, hold, rng, observations, rewards
-    ):
-        stamp  # noqa: B018  (closing over it puts it into the cache key)
-        for i in range(actions.shape[0]):
-            if not arena.active[i]:
-                continue
-            arena.outcome[i] = _decide(arena, rules, i, actions[i], hold, rng)
-            observe_into(arena, rules, i, observations[i])
-            rewards[i] = 0.0
-            for k in range(arena.terms.shape[1]):
-                arena.terms[i, k] *= rules.scale
-                rewards[i] += arena.terms[i, k]
-
-    @njit(cache=True)
-    def begin(arena, rules, i, rng, observation):  # type: ignore[no-untyped-def]
-        stamp  # noqa: B018
-        _begin(arena, rules, i, rng, observation)
-
-    return step, begin
-
-
-_step, _begin_compiled = _compile(source_stamp("vehicle", "vehicle_params", "collision", "estimate", "raycast", "scene"))
-
-
+@njit(cache=True)
 def step_all(
     arena: Arena, rules: Rules, actions: F64, hold: int, rng: np.random.Generator, observations: NDArray[np.float32], rewards: F64
 ) -> None:
@@ -344,9 +315,12 @@ def step_all(
 
     `actions` [N, 4] are in SI units within the limits. Also writes `arena.outcome` and `arena.terms`.
     """
-    _step(arena, rules, actions, hold, rng, observations, rewards)
-
-
-def begin_episode(arena: Arena, rules: Rules, i: int, rng: np.random.Generator, observation: NDArray[np.float32]) -> None:
-    """First scan, estimate and observation of an episode whose rows have been filled."""
-    _begin_compiled(arena, rules, i, rng, observation)
+    for i in range(actions.shape[0]):
+        if not arena.active[i]:
+            continue
+        arena.outcome[i] = _decide(arena, rules, i, actions[i], hold, rng)
+        observe_into(arena, rules, i, observations[i])
+        rewards[i] = 0.0
+        for k in range(arena.terms.shape[1]):
+            arena.terms[i, k] *= rules.scale
+            rewards[i] += arena.terms[i, k]

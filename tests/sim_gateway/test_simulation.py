@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_gateway.corridor import CorridorConfig, generate_corridor
-from sim_gateway.kernel_stamp import source_stamp
 from sim_gateway.lidar import LidarConfig
 from sim_gateway.raycast import cast_rays_numpy
 from sim_gateway.scene import Mover, World
@@ -237,8 +236,3 @@ def test_senseless_steps_and_setpoints_are_refused(n_steps, setpoint, yaw_rate):
 def test_senseless_wind_is_refused(change):
     with pytest.raises(ValueError, match="wind"):
         WindConfig(**change)
-
-
-def test_the_stamp_changes_with_the_sources():
-    assert source_stamp("vehicle") == source_stamp("vehicle")
-    assert source_stamp("vehicle") != source_stamp("vehicle", "scene")
