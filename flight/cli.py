@@ -78,6 +78,7 @@ def _confirm(connection: str, yes: bool) -> None:
 def main() -> None:
     """Entry point: errors are one line on stderr, without a traceback."""
     logging.basicConfig(level=logging.WARNING, format="fly: %(message)s", stream=sys.stderr)
+    logging.getLogger("flight").setLevel(logging.ERROR)  # before arming, what matters ends in the one line below
     try:
         code = app(standalone_mode=False)
     except FlyError as error:

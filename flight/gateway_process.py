@@ -26,6 +26,7 @@ from flight.errors import GatewayError
 MAX_READY_LINE = 4 * 1024 * 1024
 MAX_REPORT_BYTES = 256 * 1024 * 1024
 STOP_DEADLINE_S = 10.0
+ERROR_PREFIX = "sim-gateway: "
 Box = tuple[float, float, float, float, float, float]
 
 
@@ -131,13 +132,14 @@ class GatewayProcess:
         return None
 
     def _last_words(self) -> str:
-        """The last line the gateway wrote on standard error, without its own name."""
+        """The gateway's own error line on standard error, else the last line there."""
         with contextlib.suppress(OSError):
             self._stderr.seek(0, os.SEEK_END)
             self._stderr.seek(max(0, self._stderr.tell() - 4096))
             lines = self._stderr.read().decode("utf-8", "replace").strip().splitlines()
+            own = [line.removeprefix(ERROR_PREFIX) for line in lines if line.startswith(ERROR_PREFIX)]
             if lines:
-                return f": {lines[-1].strip().removeprefix('sim-gateway: ')[:300]}"
+                return f": {(own or lines)[-1].strip()[:300]}"
         return ""
 
 

@@ -39,7 +39,7 @@ from flight.telemetry import MESSAGES, Telemetry
 from safety.frames import CorridorFrame
 from safety.messages import SafeCommand, VehicleState
 
-log = logging.getLogger("fly.link")
+log = logging.getLogger("flight.link")
 
 COMMAND_DEADLINE_S = 3.0
 MODE_DEADLINE_S = 3.0

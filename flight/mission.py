@@ -9,14 +9,15 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from flight.errors import MissionError
 from flight.lidar.config import LidarSource
 from flight.px4 import LossAction
 from safety.config import SafetyConfig
+from safety.escalation import EscalationConfig
 from safety.frames import CorridorVector
 from strict_yaml import ConfigError, load_config
 
@@ -85,15 +86,13 @@ class TimeoutSection(_Section):
 
 
 class FailsafeSection(_Section):
-    """What happens when something is wrong. Braking comes first always; these are the steps after it.
+    """What happens when something is wrong. Braking comes first always; `escalation` gives the steps after it.
 
     `setpoint_loss_*` are PX4's own reaction when the setpoint stream stops (COM_OF_LOSS_T, COM_OBL_RC_ACT): set and read
     back before OFFBOARD.
     """
 
-    hold_after_s: float = Field(
-        default=2.0, gt=0.0, le=10.0, description="braking without a cure for this long: PX4 Hold, then land"
-    )
+    escalation: EscalationConfig = EscalationConfig.model_validate({})
     stall_s: float = Field(default=0.15, gt=0.05, le=0.5, description="a loop this late brakes before it flies on")
     setpoint_loss_timeout_s: float = Field(default=0.5, ge=0.3, le=2.0)
     setpoint_loss_action: Literal["hold", "land"] = "hold"
@@ -124,65 +123,95 @@ class SimSection(_Section):
 
 
 class Mission(_Section):
-    """A whole mission, checked. Made by `load_mission`."""
+    """A whole mission, checked. Made by `load_mission`.
+
+    The order of the fields matters: each is checked against those above it, so that the error names its own line.
+    """
 
     name: str = Field(default="flight", pattern=r"^[A-Za-z0-9_-]{1,40}$", description="part of the run folder's name")
     vehicle: VehicleSection = VehicleSection()
     policy: PolicySection
+    safety: SafetyConfig
     frame: FrameSection = FrameSection()
     takeoff_height_m: float = Field(gt=0.3, le=50.0)
     goal: GoalSection
     lidar: LidarSource = LidarSource()
-    safety: SafetyConfig
     timeouts: TimeoutSection = TimeoutSection()
     failsafe: FailsafeSection = FailsafeSection()
-    sim: SimSection | None = None
+    sim: SimSection | None = Field(default=None, validate_default=True)
 
     @property
     def simulated(self) -> bool:
         """Whether the gateway is started for this mission."""
         return self.vehicle.connection == SIM
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if self.simulated and self.sim is None:
-            raise ValueError("sim: this section is required with vehicle.connection: sim; add at least sim.world")
-        if not self.simulated and "world" in (self.goal.position_m, self.frame.takeoff_point_m):
-            raise ValueError("`world` positions need vehicle.connection: sim; give numbers")
-        if self.goal.position_m != "world":
-            _raise_first(goal_problem(CorridorVector(*self.goal.position_m), self.safety))
-        if self.frame.takeoff_point_m != "world":
-            _raise_first(takeoff_problem(self.frame.takeoff_point_m, self.takeoff_height_m, self.safety))
-        return self
+    @field_validator("frame")
+    @classmethod
+    def _frame_fits(cls, frame: FrameSection, info: ValidationInfo) -> FrameSection:
+        point = frame.takeoff_point_m
+        if point == "world":
+            _needs_sim("takeoff_point_m", info)
+        elif "safety" in info.data:
+            _raise(takeoff_point_problem(point, info.data["safety"]))
+        return frame
+
+    @field_validator("takeoff_height_m")
+    @classmethod
+    def _height_fits(cls, height_m: float, info: ValidationInfo) -> float:
+        if "safety" in info.data:
+            low, high = info.data["safety"].keep_in()
+            _raise(_outside("", height_m, low[2], high[2], "change it or widen safety.fence"))
+        return height_m
+
+    @field_validator("goal")
+    @classmethod
+    def _goal_fits(cls, goal: GoalSection, info: ValidationInfo) -> GoalSection:
+        if goal.position_m == "world":
+            _needs_sim("position_m", info)
+        elif "safety" in info.data:
+            _raise(goal_problem(CorridorVector(*goal.position_m), info.data["safety"]))
+        return goal
+
+    @field_validator("sim")
+    @classmethod
+    def _sim_is_there(cls, sim: SimSection | None, info: ValidationInfo) -> SimSection | None:
+        if sim is None and "vehicle" in info.data and info.data["vehicle"].connection == SIM:
+            raise ValueError("this section is required with vehicle.connection: sim; add it with at least a `world`")
+        return sim
 
 
 def goal_problem(goal: CorridorVector, safety: SafetyConfig) -> str | None:
-    """What is wrong with a goal, or None: it must lie in the eroded fence, or the safety filter would never let it be reached."""
+    """What is wrong with a goal, or None: outside the eroded fence the safety filter would never let it be reached."""
     low, high = safety.keep_in()
     for axis, value, lowest, highest in zip("xyz", (goal.x, goal.y, goal.z), low, high, strict=True):
-        if not lowest <= value <= highest:
-            return (
-                f"goal.position_m {axis} = {value:g} m is outside the safe part of the fence, {lowest:.2f} .. {highest:.2f} m "
-                "(fence less vehicle, position error and margin); move the goal or widen safety.fence"
-            )
+        problem = _outside(f"goal.position_m {axis} = ", value, lowest, highest, "move the goal or widen safety.fence")
+        if problem is not None:
+            return problem
     return None
 
 
-def takeoff_problem(point: tuple[float, float], height_m: float, safety: SafetyConfig) -> str | None:
-    """What is wrong with takeoff point and height, or None: the hover point must lie in the eroded fence."""
+def takeoff_point_problem(point: tuple[float, float], safety: SafetyConfig) -> str | None:
+    """What is wrong with a takeoff point, or None: the vehicle hovers above it, so it must lie in the eroded fence."""
     low, high = safety.keep_in()
     for axis, value, lowest, highest in zip("xy", point, low, high, strict=False):
-        if not lowest <= value <= highest:
-            return (
-                f"frame.takeoff_point_m {axis} = {value:g} m is outside the safe part of the fence, {lowest:.2f} .. "
-                f"{highest:.2f} m; move it or widen safety.fence"
-            )
-    if not low[2] <= height_m <= high[2]:
-        return (
-            f"takeoff_height_m = {height_m:g} m is outside the safe part of the fence, {low[2]:.2f} .. {high[2]:.2f} m; "
-            "change it or safety.fence"
-        )
+        problem = _outside(f"frame.takeoff_point_m {axis} = ", value, lowest, highest, "move it or widen safety.fence")
+        if problem is not None:
+            return problem
     return None
+
+
+def _outside(what: str, value: float, low: float, high: float, advice: str) -> str | None:
+    if low <= value <= high:
+        return None
+    return (
+        f"{what}{value:g} m is outside the safe part of the fence, {low:.2f} .. {high:.2f} m "
+        f"(fence less vehicle, position error and margin); {advice}"
+    )
+
+
+def _needs_sim(field: str, info: ValidationInfo) -> None:
+    if "vehicle" in info.data and info.data["vehicle"].connection != SIM:
+        raise ValueError(f"{field}: `world` needs vehicle.connection: sim; give numbers")
 
 
 def load_mission(path: str | Path, seed: int | None = None) -> Mission:
@@ -207,6 +236,6 @@ def _resolve(mission_file: Path, path: Path) -> Path:
     return path if path.is_absolute() else (mission_file.parent / path)
 
 
-def _raise_first(problem: str | None) -> None:
+def _raise(problem: str | None) -> None:
     if problem is not None:
         raise ValueError(problem)

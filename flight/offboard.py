@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from flight.errors import ExitCode, VehicleCommandError
 from flight.interrupt import Interrupt
@@ -26,6 +26,7 @@ from flight.rate_keeper import RateKeeper
 from flight.status import Status
 from flight.tick import Pilot, TickRecord
 from flight.trajectory import FlightLog
+from safety.escalation import EscalationState, Level, escalate
 from safety.frames import CorridorFrame, CorridorVector
 from safety.messages import SafeCommand
 
@@ -33,8 +34,10 @@ STILL = SafeCommand(CorridorVector(0.0, 0.0, 0.0), 0.0)
 SETPOINTS_BEFORE_OFFBOARD_S = 1.0
 STUCK_PROGRESS_M = 0.5
 LINK_LOST_S = 3.0
+SCAN_MARGIN_S = 0.004
 MAX_STALLS = 3
 STALL_WINDOW_S = 5.0
+LOSS_CERTAINTY = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +71,8 @@ class OffboardFlight:
         self._link, self._lidar, self._pilot, self._frame = link, lidar, pilot, frame
         self._mission, self._interrupt, self._status, self._clock = mission, interrupt, status, clock
         self._sent_s = -math.inf
+        self._engaged = False
+        self._loss_certain_s = LOSS_CERTAINTY * mission.failsafe.setpoint_loss_timeout_s
         self._reboots = link.telemetry.clock.reboots
         self._judge = FlightJudge(mission)
 
@@ -81,23 +86,38 @@ class OffboardFlight:
         self._pilot.reset()
         self._link.set_mode(FlightMode.OFFBOARD, keep_alive=self.stay)
 
+        self._engaged = True
+
     def stay(self) -> None:
-        """Keep the stream alive with zero velocity, at the loop's rate however often it is called."""
-        if self._clock() - self._sent_s >= 1.0 / LOOP_RATE_HZ:
+        """Keep the stream alive with zero velocity, at the loop's rate however often it is called.
+
+        A stream that broke off in OFFBOARD long enough for PX4's loss action is not taken up again.
+        """
+        silent_s = self._clock() - self._sent_s
+        if self._engaged and silent_s > self._loss_certain_s:
+            return
+        if silent_s >= 1.0 / LOOP_RATE_HZ:
             self._sent_s = self._link.send_velocity(STILL, self._frame)
 
     def run(self) -> Ending:
         """Fly until there is a reason to end. Raises nothing for what the vehicle or the policy does."""
         self._status.start_live(self._clock())
-        self.keeper.reset()
         try:
             with _quiet_interpreter():
+                self.stay()
+                self._align_with_scans()
                 while True:
                     ending = self._step()
                     if ending is not None:
                         return ending
         finally:
             self._status.stop_live()
+
+    def _align_with_scans(self) -> None:
+        """Start the loop's grid a little after a scan came in: at equal rates every tick then finds one that is fresh."""
+        self._lidar.wait_for_scan(2.0 / LOOP_RATE_HZ)
+        time.sleep(SCAN_MARGIN_S)
+        self.keeper.reset()
 
     def _step(self) -> Ending | None:
         now_s = self.keeper.wait()
@@ -109,6 +129,8 @@ class OffboardFlight:
             return self._after_stall(now_s)
         scan, state = self._lidar.latest(), self._link.state(self._frame)
         record = self._pilot.tick(scan, state, now_s)
+        if self._judge.pausing(record) and record.sent != STILL:
+            record = replace(record, sent=STILL)
         self._sent_s = self._link.send_velocity(record.sent, self._frame)
         self.log.append(record, self._sent_s)
         self.log.see(scan, state)
@@ -116,8 +138,17 @@ class OffboardFlight:
         return self._judge.ending(record)
 
     def _after_stall(self, now_s: float) -> Ending | None:
-        """The loop was held up: brake first, and look again in the next tick with samples that arrived since."""
-        self.events.append(f"loop stalled for {now_s - self._sent_s:.2f} s")
+        """The loop was held up: brake first, and look again in the next tick with samples that arrived since.
+
+        After a stall as long as PX4's loss timeout nothing is sent: PX4 has taken over, or is about to, and a single
+        setpoint would throw it back into OFFBOARD.
+        """
+        stalled_s = now_s - self._sent_s
+        self.events.append(f"loop stalled for {stalled_s:.2f} s")
+        if stalled_s > self._loss_certain_s:
+            action = self._mission.failsafe.setpoint_loss_action
+            message = f"the loop stood still for {stalled_s:.1f} s: PX4's own loss action ({action}) has the vehicle now"
+            return Ending("loop_stalled", ExitCode.SAFETY_ENDED, message, in_control=False)
         self._sent_s = self._link.send_velocity(STILL, self._frame)
         self.stall_times_s.append(now_s)
         recent = [time_s for time_s in self.stall_times_s[-MAX_STALLS:] if now_s - time_s < STALL_WINDOW_S]
@@ -155,40 +186,34 @@ class OffboardFlight:
 
 
 class FlightJudge:
-    """Ends a flight that has arrived, that gets nowhere, or that the safety filter has been holding for too long."""
+    """Ends a flight that has arrived, that gets nowhere, or that the safety layer's escalation ends. No I/O, no clock."""
 
     def __init__(self, mission: Mission) -> None:
-        self._mission = mission
+        self.escalation = EscalationState()
+        self._config = mission.failsafe.escalation
+        self._timeouts = mission.timeouts
         self._started_s = math.nan
         self._best_m = math.inf
         self._best_s = math.nan
-        self._braking_since_s = math.nan
+
+    def pausing(self, record: TickRecord) -> bool:
+        """Take note of this tick's verdict; True while a fault, or the healthy second after it, forbids to move."""
+        self.escalation = escalate(self.escalation, record.verdict, record.now_s, self._config)
+        return self.escalation.level >= Level.BRAKE
 
     def ending(self, record: TickRecord) -> Ending | None:
-        """The ending that this tick brings, or None."""
-        now_s = record.now_s
+        """The ending that this tick brings, or None. Call `pausing` first."""
         if math.isnan(self._started_s):
-            self._started_s = self._best_s = now_s
+            self._started_s = self._best_s = record.now_s
         if record.goal_reached:
             return Ending("goal_reached", ExitCode.GOAL_REACHED, f"goal reached ({record.distance_to_goal_m:.2f} m)")
-        return self._held(record) or self._late(record)
-
-    def _held(self, record: TickRecord) -> Ending | None:
-        if not record.verdict.braking:
-            self._braking_since_s = math.nan
-            return None
-        if math.isnan(self._braking_since_s):
-            self._braking_since_s = record.now_s
-        hold_after_s = self._mission.failsafe.hold_after_s
-        if record.now_s - self._braking_since_s < hold_after_s:
-            return None
-        rules = ", ".join(sorted({item.rule for item in record.verdict.interventions})) or "no command"
-        return Ending(
-            "safety", ExitCode.SAFETY_ENDED, f"braking for {hold_after_s:g} s without a cure ({rules}): holding, then landing"
-        )
+        if self.escalation.level >= Level.HOLD:
+            cause = self.escalation.cause
+            return Ending("safety", ExitCode.SAFETY_ENDED, f"safety ended the flight ({cause}): holding, then landing")
+        return self._late(record)
 
     def _late(self, record: TickRecord) -> Ending | None:
-        timeouts = self._mission.timeouts
+        timeouts = self._timeouts
         if record.now_s - self._started_s > timeouts.flight_s:
             return Ending("timeout", ExitCode.NOT_REACHED, f"goal not reached within {timeouts.flight_s:g} s")
         if record.distance_to_goal_m < self._best_m - STUCK_PROGRESS_M:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flight.errors import MissionError
 
-log = logging.getLogger("fly.results")
+log = logging.getLogger("flight.results")
 
 
 def make_run_folder(wanted: Path | None, name: str) -> Path:

@@ -22,7 +22,7 @@ from flight.interrupt import Interrupt
 from flight.landing import Landing
 from flight.lidar import ScipDriver, open_lidar
 from flight.link import VehicleLink, check_port_is_free
-from flight.mission import Mission, goal_problem, takeoff_problem
+from flight.mission import Mission, goal_problem, takeoff_point_problem
 from flight.offboard import Ending, OffboardFlight
 from flight.preflight import (
     LOOP_RATE_HZ,
@@ -46,7 +46,7 @@ from policy_export.runner import PolicyRunner
 from safety.filter import SafetyFilter
 from safety.frames import CorridorFrame, CorridorVector, NedVector
 
-log = logging.getLogger("fly")
+log = logging.getLogger("flight.session")
 
 ANCHOR_SAMPLES = 25
 ANCHOR_PERIOD_S = 0.04
@@ -144,7 +144,7 @@ class FlightSession:
         place = Place(takeoff, ready.start_yaw_rad if ready is not None else 0.0, CorridorVector(*goal))
         for problem in (
             goal_problem(place.goal, mission.safety),
-            takeoff_problem(takeoff, mission.takeoff_height_m, mission.safety),
+            takeoff_point_problem(takeoff, mission.safety),
         ):
             if problem is not None:
                 raise RefusedError(f"this world does not fit the mission: {problem}")
@@ -226,6 +226,7 @@ class FlightSession:
     def _fly(self, link: VehicleLink, flight: OffboardFlight, frame: CorridorFrame) -> tuple[Ending, bool]:
         """Arm to disarm. From arming on, every exception ends in the landing."""
         self._arm(link)
+        logging.getLogger("flight").setLevel(logging.WARNING)
         try:
             ending = self._take_off(link, frame) or self._engage_and_run(flight)
         except VehicleCommandError as error:
