@@ -66,6 +66,7 @@ class SafetyConfig(_Frozen):
 
     blind_speed_m_s: NotNegative = Field(0.3, description="speed allowed into directions the LiDAR does not see")
     return_speed_m_s: Positive = Field(0.3, description="speed allowed while nearer than the margin or outside the fence")
+    hold_off_speed_m_s: NotNegative = Field(0.25, description="speed out of a margin when drift, not a command, leads into it")
     fov_margin_rad: NotNegative = Field(0.1, description="this much of each edge of the field of view counts as unseen")
     memory_s: NotNegative = Field(20.0, description="returns that left the field of view are remembered this long")
     memory_hold_s: NotNegative = Field(0.12, description="a return is kept this long although newer scans look past it")
@@ -99,6 +100,8 @@ class SafetyConfig(_Frozen):
             ("lag_min_s", "lag_s"),
             ("blind_speed_m_s", "max_horizontal_speed_m_s"),
             ("return_speed_m_s", "max_horizontal_speed_m_s"),
+            ("hold_off_speed_m_s", "return_speed_m_s"),
+            ("hold_off_speed_m_s", "max_vertical_speed_m_s"),
             ("memory_hold_s", "memory_s"),
         ):
             if getattr(self, low) > getattr(self, high):

@@ -1,10 +1,7 @@
 """Fence and obstacles together: the nearest command whose brake tube stays inside one and clear of the other.
 
-A command passes when its brake tube (safety.braking) is nowhere nearer to a known obstacle, and nowhere further out of the eroded
-fence, than allowed. Allowed is the keep-out distance, or, where even braking cannot hold it (bad start, drift, an obstacle that
-appears), what braking reaches, judged point by point: no violation may grow, and every way out of it stays open. So that a
-vehicle just inside the margin can slide along a wall, points that braking keeps clear of may be neared to half the margin then.
-Where even braking would bring the hull onto a point, no command may have any part towards it.
+A command passes when its brake tube (safety.braking) keeps what braking itself would keep (safety.allowance). If the wanted one
+does not pass, a fixed number of scaled, turned and projected ones are tried; if none passes, zero velocity is sent.
 """
 
 from __future__ import annotations
@@ -16,18 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from safety.braking import Start, Tubes, stop_gain_s, tubes
+from safety.allowance import EPSILON_M, Allowance, allowance
+from safety.braking import Start, Tubes, tubes
 from safety.config import SafetyConfig
 from safety.frames import CorridorVector
 from safety.lidar import SeenScan, blind
 from safety.messages import Intervention
 
 Floats = NDArray[np.float64]
-EPSILON_M = 1e-9  # rounding of one tube check
 SCALES = (0.8, 0.6, 0.4, 0.2, 0.1, 0.05)
 TURNS_RAD = tuple(math.radians(angle) for angle in (15.0, 30.0, 45.0, 60.0, 75.0, 85.0))
+PUSHES = (1.0, 1.5)  # candidates are shifted by these multiples of what leads out of a margin
 OUTWARD = (0.0, 0.1)  # slid candidates: this share of the wanted speed away from the obstacle
-SLIDE_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +57,6 @@ class Shield:
         self._config = config
         low, high = config.keep_in()
         self._low, self._high = np.array(low), np.array(high)
-        self._gain_s = stop_gain_s(config)
         directions = [(scale, 0.0) for scale in SCALES]
         directions += [(math.cos(turn), sign * turn) for turn in TURNS_RAD for sign in (1, -1)]
         self._scaled = np.array([(scale * math.cos(turn), scale * math.sin(turn)) for scale, turn in directions])
@@ -129,54 +125,43 @@ class Shield:
         capped: Floats = candidates * np.stack((factor, factor, np.ones_like(factor)), axis=1)
         return capped
 
-    def _judge(self, first: Floats, around: Surroundings, found: list[Intervention]) -> tuple[bool, _Allowed]:
+    def _judge(self, first: Floats, around: Surroundings, found: list[Intervention]) -> tuple[bool, Allowance]:
         """Judge the wanted command (row 0) against the allowance that braking (row 1) sets."""
         tube = tubes(around.start, first, self._config)
         clear, fence = self._tube_clearances(tube, around), self._tube_fence(tube)
-        hit = clear[1] < -self._config.margin_m
-        towards = np.stack((around.x_m[hit] - around.position.x, around.y_m[hit] - around.position.y))
-        allowed = _Allowed(self._allowed_clearances(clear[1]), towards, np.minimum(0.0, fence[1]), tube.stop_m[:, 1])
-        short = clear[0] - allowed.clearance_m
-        worst = int(np.argmin(short)) if short.shape[0] else -1
-        obstacle_ok = worst < 0 or (float(short[worst]) >= -EPSILON_M and bool(allowed.retreats(first[:1])[0]))
-        face = int(np.argmin(fence[0] - allowed.fence_m))
-        fence_ok = float(fence[0, face]) >= float(allowed.fence_m[face]) - EPSILON_M
-        if not fence_ok:
-            found.append(Intervention("fence", float(fence[0, face]), float(allowed.fence_m[face])))
-        if not obstacle_ok:
-            found.append(Intervention("obstacle", float(clear[0, worst]), float(allowed.clearance_m[worst])))
-        return obstacle_ok and fence_ok, allowed
-
-    def _allowed_clearances(self, brake_m: Floats) -> Floats:
-        """How near each point [k] may come, given how near braking comes to it: 0 unless braking itself goes below."""
-        if brake_m.shape[0] == 0:
-            return brake_m
-        slide = max(min(0.0, float(brake_m.min())), -SLIDE_SHARE * self._config.margin_m)
-        return np.minimum(brake_m, slide)
+        points, position = np.stack((around.x_m, around.y_m)), np.array((around.position.x, around.position.y))
+        allowed = allowance(tube, clear[1], fence[1], points, position, self._config)
+        passed = bool(allowed.permits(first[:1], clear[:1], fence[:1])[0])
+        if not passed:
+            found.extend(_reasons(allowed, first[0], clear[0], fence[0]))
+        return passed, allowed
 
     def _nearest(
-        self, wanted: Floats, around: Surroundings, allowed: _Allowed, clearance_m: float, fence_margin_m: float
+        self, wanted: Floats, around: Surroundings, allowed: Allowance, clearance_m: float, fence_margin_m: float
     ) -> Floats:
         """Of all candidates that pass, the one nearest to the wanted vector [3]; zeros when none passes."""
-        candidates = self._fenced(self._candidates(wanted, around, allowed), allowed)
-        candidates = self._view_capped(candidates, around, clearance_m, fence_margin_m, [])
+        candidates = self._view_capped(self._candidates(wanted, around, allowed), around, clearance_m, fence_margin_m, [])
+        candidates = allowed.clipped(candidates)
         tube = tubes(around.start, candidates, self._config)
-        fence_ok = (self._tube_fence(tube) >= allowed.fence_m - EPSILON_M).all(axis=1)
-        clear_ok = (self._tube_clearances(tube, around) >= allowed.clearance_m - EPSILON_M).all(axis=1)
-        passed: NDArray[np.bool_] = fence_ok & clear_ok & allowed.retreats(candidates)
+        passed = allowed.permits(candidates, self._tube_clearances(tube, around), self._tube_fence(tube))
         away = candidates - wanted
         cost = np.where(passed, np.einsum("ci,ci->c", away, away), math.inf)
         best = int(np.argmin(cost))
         return candidates[best] if passed[best] else np.zeros(3)
 
-    def _candidates(self, wanted: Floats, around: Surroundings, allowed: _Allowed) -> Floats:
+    def _candidates(self, wanted: Floats, around: Surroundings, allowed: Allowance) -> Floats:
         """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""
         x, y, z = wanted
         a, b = self._scaled[:, 0], self._scaled[:, 1]
         rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], np.array([[0.0, 0.0, z]])]
         if around.x_m.shape[0]:
-            rows += [self._slid(wanted, around, stop) for stop in allowed.stop_m]
-        return np.concatenate(rows)
+            rows += [self._slid(wanted, around, stop) for stop in allowed.brake_stop_m]
+        plain = np.concatenate(rows)
+        push = allowed.push_m_s
+        if not push.any():
+            return plain
+        pushed = [plain + np.array((*(share * push), 0.0)) for share in PUSHES]
+        return np.concatenate((plain, *pushed))
 
     def _slid(self, wanted: Floats, around: Surroundings, stop_m: Floats) -> Floats:
         """The wanted vector without its part towards the point nearest to where braking ends, [2, 3]."""
@@ -186,13 +171,6 @@ class Shield:
         normal = np.array((dx[nearest], dy[nearest], 0.0)) / max(float(distance[nearest]), EPSILON_M)
         inward, length = min(0.0, float(wanted @ normal)), math.hypot(wanted[0], wanted[1])
         return np.stack([wanted - (inward - share * length) * normal for share in OUTWARD])
-
-    def _fenced(self, candidates: Floats, allowed: _Allowed) -> Floats:
-        """Candidates with each axis shortened so far that its stop point stays inside the box (faces are independent axes)."""
-        above = np.maximum(0.0, (self._high - allowed.stop_m).min(axis=0)) / self._gain_s
-        below = np.maximum(0.0, (allowed.stop_m - self._low).min(axis=0)) / self._gain_s
-        clipped: Floats = np.minimum(np.maximum(candidates, -below), above)
-        return clipped
 
     def _tube_fence(self, tube: Tubes) -> Floats:
         """Smallest distance inside each face of the eroded fence over a tube's corners, [c, 6], negative outside, m."""
@@ -208,24 +186,21 @@ class Shield:
         return _leg_clearances(tube.turn_m, tube.stop_m, turned, stopped, around) - config.keep_out_m
 
 
-@dataclass(frozen=True, slots=True)
-class _Allowed:
-    """What a command may do at most, given what braking does.
-
-    `clearance_m` [k], `fence_m` [6]: how far a tube may violate the clearance to each point and each face of the fence (<= 0).
-    `towards_m` [2, h]: from the vehicle to the points that braking hits. `stop_m` [2 models, 3]: where braking ends.
-    """
-
-    clearance_m: Floats
-    towards_m: Floats
-    fence_m: Floats
-    stop_m: Floats
-
-    def retreats(self, candidates: Floats) -> NDArray[np.bool_]:
-        """Which commands [c, 3] have no part towards any point that braking would hit."""
-        part = candidates[:, :1] * self.towards_m[0] + candidates[:, 1:2] * self.towards_m[1]
-        retreating: NDArray[np.bool_] = (part <= EPSILON_M).all(axis=1)
-        return retreating
+def _reasons(allowed: Allowance, wanted: Floats, clear_m: Floats, fence_m: Floats) -> list[Intervention]:
+    """Which rules refuse the wanted command [3], each at its worst place."""
+    reasons: list[Intervention] = []
+    face = int(np.argmin(fence_m - allowed.fence_m))
+    outside = float(np.maximum(allowed.low_m_s - wanted, wanted - allowed.high_m_s).max()) > EPSILON_M
+    if outside or fence_m[face] < allowed.fence_m[face] - EPSILON_M:
+        reasons.append(Intervention("fence", float(fence_m[face]), float(allowed.fence_m[face])))
+    if clear_m.shape[0]:
+        worst = int(np.argmin(clear_m - allowed.clearance_m))
+        if clear_m[worst] < allowed.clearance_m[worst] - EPSILON_M:
+            reasons.append(Intervention("obstacle", float(clear_m[worst]), float(allowed.clearance_m[worst])))
+    lacking = float(allowed.shortfall_m_s(wanted[None])[0])
+    if lacking > EPSILON_M:
+        reasons.append(Intervention("hold_off", lacking, 0.0))
+    return reasons
 
 
 def _leg_clearances(begin_m: Floats, end_m: Floats, error_begin_m: float, error_end_m: float, around: Surroundings) -> Floats:

@@ -117,11 +117,12 @@ def test_away_from_everything_the_command_is_unchanged_bit_for_bit(turn, vz, rat
 
 @given(boxes_around, st.tuples(speed, speed, st.floats(-0.5, 0.5)), angle)
 @quick
-def test_zero_is_always_allowed(boxes, v, yaw):
+def test_zero_is_allowed_unless_drift_must_be_held_off(boxes, v, yaw):
     assume(outside(boxes))
     sent, verdict = once(command(), state(x=X0, v=v, yaw=yaw), view(boxes, yaw=yaw))
-    assert norm(sent.velocity) == 0.0
-    assert verdict.interventions == ()
+    rules = {found.rule for found in verdict.interventions}
+    assert rules <= {"hold_off"}
+    assert norm(sent.velocity) <= (1.5 * 0.25 + 1e-9 if rules else 0.0)
 
 
 @given(boxes_around, speed, speed, st.floats(-0.5, 0.5), st.floats(-0.8, 0.8), st.floats(-0.4, 0.4))
@@ -142,7 +143,7 @@ def test_nearer_wall_never_allows_more(distance, nearer, wanted, v):
     pose = state(x=X0, v=(v, 0, 0))
     far, _ = once(command(wanted), pose, view(wall(distance)))
     near, _ = once(command(wanted), pose, view(wall(distance - nearer)))
-    assert near.velocity.x <= far.velocity.x + 1e-9
+    assert near.velocity.x <= max(far.velocity.x, 0.0) + 1e-9
 
 
 @pytest.mark.parametrize(
@@ -203,6 +204,7 @@ def test_removing_an_obstacle_never_adds_a_restriction(boxes, index, ux, uy):
 @quick
 def test_mirrored_world_gives_the_mirrored_command(boxes, ux, uy, vx, vy):
     """Edge 25: a filter that confuses left and right fails here."""
+    assume(outside(boxes))
     mirrored = [(b[0], -b[3], b[2], -b[1]) for b in boxes]
     here, _ = once(command(ux, uy), state(x=X0, v=(vx, vy, 0)), view(boxes))
     there, _ = once(command(ux, -uy), state(x=X0, v=(vx, -vy, 0)), view(mirrored))
@@ -213,6 +215,7 @@ def test_mirrored_world_gives_the_mirrored_command(boxes, ux, uy, vx, vy):
 @quick
 def test_turned_world_gives_the_turned_command(boxes, quarters, ux, uy, v):
     """Quarter turns of world, vehicle and command; the box fence is far away."""
+    assume(outside(boxes))
     turned, c, s = [], round(math.cos(quarters * math.pi / 2)), round(math.sin(quarters * math.pi / 2))
     for x0, y0, x1, y1 in boxes:
         xs, ys = sorted((c * x0 - s * y0, c * x1 - s * y1)), sorted((s * x0 + c * y0, s * x1 + c * y1))
@@ -239,6 +242,7 @@ def test_shifted_world_gives_the_same_command(boxes, ux, uy, dx, dy):
 @quick
 def test_yaw_counts_modulo_a_full_turn(boxes, ux, uy, turns):
     """Edge 15: yaw wraps."""
+    assume(outside(boxes))
     here, _ = once(command(ux, uy), state(x=X0), view(boxes))
     there, _ = once(command(ux, uy), state(x=X0, yaw=2 * math.pi * turns), view(boxes))
     assert away(command(ux, uy), there) == pytest.approx(away(command(ux, uy), here), abs=1e-6)
@@ -355,4 +359,5 @@ def test_outside_the_fence_only_the_way_back_is_open(where, out, face):
     assert dataclasses.astuple(home.velocity)[axis] * inward > 0.0
     assert verdict.fence_margin_m < 0.0
     u[axis] *= -1.0
-    assert dataclasses.astuple(once(command(*u), state(*p), scan(), ground_z_m=-100.0)[0].velocity)[axis] == 0.0
+    further = dataclasses.astuple(once(command(*u), state(*p), scan(), ground_z_m=-100.0)[0].velocity)[axis]
+    assert 0.0 <= further * inward <= 0.25

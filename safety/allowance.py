@@ -1,0 +1,131 @@
+"""What a command may do this tick, derived from what braking would do: the yardstick of the shield.
+
+Braking must always stay available, so nothing may be worse than braking. Beyond that:
+
+* a point or face that braking keeps clear of by the full margin must be kept clear of by the full margin;
+* once braking comes inside a margin anywhere, other points may be neared to a quarter of it, so that a vehicle can slide along;
+* a vehicle under a zero command still drifts by the error of its velocity estimate. Where it stands, or will after braking, a
+  little inside a margin, a command must therefore lead out again: slowly, and only so far in that drift explains it;
+* where braking itself would bring the hull onto a point, no command may have any part towards it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safety.braking import Tubes, stop_gain_s
+from safety.config import SafetyConfig
+
+Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
+EPSILON_M = 1e-9  # rounding of one check
+SLIDE_SHARE = 0.25  # of the margin: how far inside points may be neared, and where holding off begins
+HOLD_OFF_PER_S = 10.0  # speed outwards per metre inside; acts on the stop point, which follows a command at once
+POINT_BAND_M = 0.05  # hold off from points up to this far inside the hull; deeper is no drift
+FENCE_BAND_M = 0.5  # the same for the fence
+_LEAST_M = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Allowance:
+    """Bounds on candidate commands of one tick.
+
+    `clearance_m` [k], `fence_m` [6]: least clearance of the tube beyond keep-out to each point, least distance inside each face
+    (low x, y, z, high x, y, z). `normals` [2, h], `outward_m_s` [h]: least part of a command along each horizontal direction.
+    `low_m_s`, `high_m_s` [3]: bounds per axis that keep the stop point inside the fence. `brake_stop_m` [2 models, 3].
+    """
+
+    clearance_m: Floats
+    fence_m: Floats
+    normals: Floats
+    outward_m_s: Floats
+    low_m_s: Floats
+    high_m_s: Floats
+    brake_stop_m: Floats
+
+    def shortfall_m_s(self, candidates: Floats) -> Floats:
+        """How much commands [c, 3] lack of the outward speed that is due, at the worst point, m/s; <= 0 is fine."""
+        if self.outward_m_s.shape[0] == 0:
+            return np.full(candidates.shape[0], -np.inf)
+        lacking: Floats = (self.outward_m_s - candidates[:, :2] @ self.normals).max(axis=1)
+        return lacking
+
+    def permits(self, candidates: Floats, clear_m: Floats, fence_m: Floats) -> Booleans:
+        """Which commands [c, 3], with tube clearances [c, k] and fence distances [c, 6], pass."""
+        clear = (clear_m >= self.clearance_m - EPSILON_M).all(axis=1)
+        inside = (fence_m >= self.fence_m - EPSILON_M).all(axis=1)
+        bounded = ((candidates >= self.low_m_s - EPSILON_M) & (candidates <= self.high_m_s + EPSILON_M)).all(axis=1)
+        permitted: Booleans = clear & inside & bounded & (self.shortfall_m_s(candidates) <= EPSILON_M)
+        return permitted
+
+    def clipped(self, candidates: Floats) -> Floats:
+        """Candidates [c, 3] brought into the bounds per axis. The faces of a box are independent axes."""
+        within: Floats = np.minimum(np.maximum(candidates, self.low_m_s), self.high_m_s)
+        return within
+
+    @property
+    def push_m_s(self) -> Floats:
+        """A horizontal velocity [2] that leads out of the points held off from; zeros when there are none."""
+        if self.outward_m_s.shape[0] == 0:
+            return np.zeros(2)
+        sum_m_s: Floats = self.normals @ self.outward_m_s
+        length = max(float(np.hypot(*sum_m_s)), _LEAST_M)
+        push: Floats = sum_m_s * (float(self.outward_m_s.max()) / length)
+        return push
+
+
+def allowance(
+    tube: Tubes, clear_m: Floats, fence_m: Floats, points_m: Floats, position_m: Floats, config: SafetyConfig
+) -> Allowance:
+    """The allowance set by braking.
+
+    `tube`: brake tubes whose last candidate is zero velocity; `clear_m` [k], `fence_m` [6]: its clearances; `points_m` [2, k];
+    `position_m` [2]: the vehicle now.
+    """
+    slide = -SLIDE_SHARE * config.margin_m
+    worst = float(clear_m.min()) if clear_m.shape[0] else 0.0
+    normals, outward = _outward(tube, clear_m, points_m, position_m, config)
+    low, high = _axis_bounds(fence_m, config)
+    return Allowance(
+        clearance_m=np.minimum(clear_m, max(min(0.0, worst), slide)),
+        fence_m=np.minimum(0.0, fence_m),
+        normals=normals,
+        outward_m_s=outward,
+        low_m_s=low,
+        high_m_s=high,
+        brake_stop_m=tube.stop_m[:, -1],
+    )
+
+
+def _outward(tube: Tubes, clear_m: Floats, points_m: Floats, position_m: Floats, config: SafetyConfig) -> tuple[Floats, Floats]:
+    """Directions [2, h] away from the points that braking comes too near to, and the speed due along each [h]."""
+    slide = SLIDE_SHARE * config.margin_m
+    here = points_m - position_m[:, None]
+    depth_here = config.keep_out_m - slide - np.sqrt((here * here).sum(axis=0))
+    depth = np.maximum(-clear_m - slide, depth_here)
+    inside = depth > 0.0
+    near_now, depth, points = (depth_here >= depth)[inside], depth[inside], points_m[:, inside]
+    begin, stop = tube.turn_m[0, -1, :2, None], tube.stop_m[0, -1, :2, None]
+    leg = stop - begin
+    share = np.clip(((points - begin) * leg).sum(axis=0) / max(float((leg * leg).sum()), _LEAST_M**2), 0.0, 1.0)
+    from_here = near_now | (depth > config.margin_m)  # the side of a point is that of the vehicle, not that of a tube beyond it
+    away = np.where(from_here, position_m[:, None], begin + share * leg) - points
+    away /= np.maximum(np.sqrt((away * away).sum(axis=0)), _LEAST_M)
+    return away, np.where(depth <= config.margin_m + POINT_BAND_M, _hold_off_m_s(depth, config), 0.0)
+
+
+def _axis_bounds(fence_m: Floats, config: SafetyConfig) -> tuple[Floats, Floats]:
+    """Least and greatest command per axis [3]: the stop point reaches a face at most; beyond it, back inwards."""
+    room = np.maximum(fence_m, 0.0) / stop_gain_s(config)
+    depth = -fence_m - SLIDE_SHARE * config.margin_m
+    inward = np.where((depth > 0.0) & (depth <= FENCE_BAND_M), _hold_off_m_s(depth, config), 0.0)
+    bound = np.where(inward > 0.0, -inward, room)
+    return -bound[:3], bound[3:]
+
+
+def _hold_off_m_s(depth_m: Floats, config: SafetyConfig) -> Floats:
+    speed: Floats = np.minimum(HOLD_OFF_PER_S * depth_m, config.hold_off_speed_m_s)
+    return speed
