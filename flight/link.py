@@ -192,6 +192,10 @@ class VehicleLink:
         self.setpoints_sent += 1
         return self._clock()
 
+    def ask_time(self) -> None:
+        """Ask the vehicle for its clock (TIMESYNC); the answer keeps `telemetry.clock` honest when the clock stood still."""
+        self._send("TIMESYNC", f'{{"tc1":0,"ts1":{int(self._clock() * 1e9)}}}')
+
     def _send(self, name: str, fields_json: str) -> None:
         from mavsdk import MavsdkError  # noqa: PLC0415
 

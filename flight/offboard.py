@@ -38,6 +38,7 @@ SCAN_MARGIN_S = 0.004
 MAX_STALLS = 3
 STALL_WINDOW_S = 5.0
 LOSS_CERTAINTY = 0.8
+TICKS_PER_TIME_QUESTION = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +136,8 @@ class OffboardFlight:
         self.log.append(record, self._sent_s)
         self.log.see(scan, state)
         self._status.publish(record, self.keeper.deadline_misses)
+        if self.keeper.ticks % TICKS_PER_TIME_QUESTION == 0:
+            self._link.ask_time()
         return self._judge.ending(record)
 
     def _after_stall(self, now_s: float) -> Ending | None:

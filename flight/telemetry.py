@@ -19,7 +19,9 @@ from safety.messages import VehicleState
 BUCKET_S = 1.0
 MAX_DRIFT = 0.01
 REBOOT_JUMP_S = 1.0
+SLIP_TOLERANCE_S = 0.02
 MAX_TEXTS = 100
+MAX_ROUND_TRIP_S = 5.0
 
 
 class BootClock:
@@ -28,7 +30,8 @@ class BootClock:
     The smallest difference belongs to the message that travelled fastest, so what remains in it is the least latency of
     the link (well under 1 ms on UDP, a few ms on a 921600 baud serial line). A smaller difference counts at once: it makes
     samples older, which is safe. A larger one is followed at `MAX_DRIFT` only: enough for any clock, while a link that
-    turns slow shows up as age for long enough to end the flight, instead of being taken for drift.
+    turns slow shows up as age for long enough to end the flight, instead of being taken for drift. Only a clock that stood
+    still (a paused simulator) may move the offset up at once, and only on proof: an answer to a question of ours, see `bound`.
     """
 
     def __init__(self) -> None:
@@ -39,6 +42,7 @@ class BootClock:
         self._arrival_s = -math.inf
         self._last_boot_s = -math.inf
         self.reboots = 0
+        self.slips = 0
 
     def to_monotonic(self, boot_s: float, arrival_s: float) -> float:
         """The instant `boot_s` on our clock, never later than `arrival_s`. A jump back of the boot time is a reboot."""
@@ -53,6 +57,17 @@ class BootClock:
         self._offset = smallest if math.isinf(self._offset) else min(smallest, allowed)
         self._arrival_s = arrival_s
         return boot_s + self._offset
+
+    def bound(self, boot_s: float, asked_s: float) -> None:
+        """The vehicle's clock showed `boot_s` at some instant after `asked_s` on ours (TIMESYNC): the offset cannot be smaller.
+
+        No delay of the link can feign this, since `asked_s` was read here before the question left.
+        """
+        smallest_possible = asked_s - boot_s
+        if self._offset < smallest_possible - SLIP_TOLERANCE_S:
+            self.slips += 1
+            self._offset = self._current = smallest_possible
+            self._previous = math.inf
 
     def _restart(self) -> None:
         self.reboots += 1
@@ -189,6 +204,12 @@ class Telemetry:
         time_s = self._sample_time("imu", _number(fields, "time_usec") * 1e-6, arrival_s)
         self.imu = Imu(time_s, _vector(fields, "xacc", "yacc", "zacc"))
 
+    def _on_timesync(self, fields: dict[str, object], arrival_s: float) -> None:
+        """An answer to `VehicleLink.ask_time`; PX4's own questions (tc1 = 0) are MAVSDK's business."""
+        boot_s, asked_s = _number(fields, "tc1") * 1e-9, _number(fields, "ts1") * 1e-9
+        if boot_s > 0.0 and 0.0 <= arrival_s - asked_s <= MAX_ROUND_TRIP_S:
+            self.clock.bound(boot_s, asked_s)
+
     def _on_heartbeat(self, fields: dict[str, object], arrival_s: float) -> None:
         self.autopilot = int(_number(fields, "autopilot"))
         self.armed = bool(int(_number(fields, "base_mode")) & MODE_FLAG_ARMED)
@@ -220,6 +241,7 @@ _HANDLERS = {
     "LOCAL_POSITION_NED": Telemetry._on_position,
     "ATTITUDE": Telemetry._on_attitude,
     "HIGHRES_IMU": Telemetry._on_imu,
+    "TIMESYNC": Telemetry._on_timesync,
     "HEARTBEAT": Telemetry._on_heartbeat,
     "CURRENT_MODE": Telemetry._on_current_mode,
     "EXTENDED_SYS_STATE": Telemetry._on_landed,

@@ -283,3 +283,40 @@ def test_modes_as_px4_packs_them() -> None:
     assert mode_name(FlightMode.RTL) == "RTL"
     assert mode_name(4 | 9 << 8) == "mode 4.9"
     assert mode_name(None) == "unknown"
+
+
+def test_a_clock_that_stood_still_is_caught_by_the_next_answer_and_a_slow_link_is_not_excused() -> None:
+    clock = BootClock()
+    for k in range(100):
+        clock.to_monotonic(10.0 + 0.02 * k, 100.0 + 0.02 * k)
+    # the simulator stood still for 0.6 s: without proof the samples look old ...
+    assert 102.6 - clock.to_monotonic(12.0, 102.6) > 0.5
+    # ... the answer to a question asked after the pause proves that the clock, not the link, is late
+    clock.bound(12.05, 102.65)
+    assert clock.slips == 1
+    assert 0.0 <= 102.7 - clock.to_monotonic(12.1, 102.7) < 0.01
+    # a link that delays the answer by 0.6 s proves nothing: the question was asked long ago
+    clock.bound(12.2, 102.8)
+    assert clock.slips == 1
+    assert 103.5 - clock.to_monotonic(12.3, 103.5) > 0.5
+
+
+@given(st.floats(0.0, 0.5), st.floats(0.0, 0.5))
+def test_no_answer_can_make_a_sample_look_younger_than_it_is(way_out_s: float, way_back_s: float) -> None:
+    clock, true_offset_s = BootClock(), 90.0
+    for k in range(50):
+        clock.to_monotonic(10.0 + 0.02 * k, true_offset_s + 10.0 + 0.02 * k)
+    asked_s = 101.5
+    clock.bound(asked_s + way_out_s - true_offset_s, asked_s)
+    boot_s = asked_s + way_out_s + way_back_s - true_offset_s
+    assert clock.to_monotonic(boot_s, boot_s + true_offset_s) <= boot_s + true_offset_s + 1e-9
+    assert clock.slips == 0
+
+
+def test_the_vehicle_answers_the_question_for_its_time(link: VehicleLink) -> None:
+    before = link.telemetry.counts.get("TIMESYNC", 0)
+    for _ in range(5):
+        link.ask_time()
+        time.sleep(0.05)
+    assert link.wait_until(lambda: link.telemetry.counts.get("TIMESYNC", 0) >= before + 5, 2.0)
+    assert link.telemetry.clock.slips == 0
