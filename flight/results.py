@@ -1,4 +1,4 @@
-"""The run folder of one flight: `summary.json`, `trajectory.csv`, `trajectory.png`."""
+"""The run folder of one flight, and what the flight came to as a whole."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flight.errors import MissionError
+from flight.errors import ExitCode, MissionError
+from flight.offboard import Ending
+from safety.frames import CorridorVector
 
 log = logging.getLogger("flight.results")
 
@@ -60,3 +62,20 @@ def truth_from_report(report: Mapping[str, Any]) -> NDArray[np.float64] | None:
     except (ValueError, TypeError):
         return None
     return table[:, 1:4] if table.ndim == 2 and table.shape[1] >= 4 else None
+
+
+def judge_flight(ending: Ending, landed: bool, contacts: Any) -> tuple[ExitCode, str, str]:
+    """Exit code, outcome and message of the whole flight: a contact or a failed landing outweighs a reached goal."""
+    if contacts:
+        return ExitCode.NOT_REACHED, "contact", f"touched an obstacle {contacts} time(s); {ending.message}"
+    if ending.exit_code is ExitCode.GOAL_REACHED and not landed:
+        return ExitCode.NOT_REACHED, "not_landed", f"{ending.message}, but not landed"
+    return ending.exit_code, ending.outcome, ending.message
+
+
+def true_distance_m(report: Mapping[str, Any], goal: CorridorVector) -> float | None:
+    """Nearest true distance to the goal, where a simulator knows it."""
+    truth = truth_from_report(report)
+    if truth is None:
+        return None
+    return float(np.min(np.linalg.norm(truth - (goal.x, goal.y, goal.z), axis=1)))

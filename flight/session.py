@@ -36,7 +36,7 @@ from flight.preflight import (
     require,
 )
 from flight.px4 import FlightMode, mode_name
-from flight.results import truth_from_report
+from flight.results import judge_flight, true_distance_m, truth_from_report
 from flight.status import Status
 from flight.summary import build_summary, write_json_atomic
 from flight.tick import Pilot
@@ -317,7 +317,7 @@ class FlightSession:
     def _results(self, flight: OffboardFlight, policy: PolicyRunner, place: Place, ending: Ending, landed: bool) -> FlightResult:
         report = self._gateway.report() if self._gateway is not None else {}
         contacts = report.get("contacts")
-        exit_code, outcome, message = _judge(ending, landed, contacts)
+        exit_code, outcome, message = judge_flight(ending, landed, contacts)
         summary = build_summary(
             flight.log,
             flight.keeper.statistics(),
@@ -337,7 +337,7 @@ class FlightSession:
                 "mission": self._mission.name,
                 "seed": self._mission.sim.seed if self._mission.sim else None,
                 "goal_m": [place.goal.x, place.goal.y, place.goal.z],
-                "true_distance_to_goal_m": _true_distance(report, place.goal),
+                "true_distance_to_goal_m": true_distance_m(report, place.goal),
             },
         )
         write_json_atomic(self._folder / "summary.json", summary)
@@ -357,20 +357,3 @@ class FlightSession:
             truth=truth_from_report(report),
             title=title,
         )
-
-
-def _judge(ending: Ending, landed: bool, contacts: Any) -> tuple[ExitCode, str, str]:
-    """Exit code, outcome and message of the whole flight: a contact or a failed landing outweighs a reached goal."""
-    if contacts:
-        return ExitCode.NOT_REACHED, "contact", f"touched an obstacle {contacts} time(s); {ending.message}"
-    if ending.exit_code is ExitCode.GOAL_REACHED and not landed:
-        return ExitCode.NOT_REACHED, "not_landed", f"{ending.message}, but not landed"
-    return ending.exit_code, ending.outcome, ending.message
-
-
-def _true_distance(report: dict[str, Any], goal: CorridorVector) -> float | None:
-    """Nearest true distance to the goal, where a simulator knows it."""
-    truth = truth_from_report(report)
-    if truth is None:
-        return None
-    return float(np.min(np.linalg.norm(truth - (goal.x, goal.y, goal.z), axis=1)))

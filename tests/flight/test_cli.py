@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from stand import Program, Stand
 
-from flight.errors import MissionError
-from flight.results import make_run_folder, remove_if_empty, truth_from_report
+from flight.errors import ExitCode, MissionError
+from flight.offboard import Ending
+from flight.results import judge_flight, make_run_folder, remove_if_empty, truth_from_report
 
 
 def test_help_has_examples_and_exit_codes() -> None:
@@ -62,3 +63,13 @@ def test_truth_of_a_report() -> None:
     assert truth.tolist() == [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
     for nothing in ({}, {"trajectory": None}, {"trajectory": {"rows": []}}, {"trajectory": {"rows": [[1.0], ["a"]]}}):
         assert truth_from_report(nothing) is None
+
+
+def test_contact_and_a_failed_landing_outweigh_the_goal() -> None:
+    reached = Ending("goal_reached", ExitCode.GOAL_REACHED, "goal reached")
+    assert judge_flight(reached, True, 0)[:2] == (ExitCode.GOAL_REACHED, "goal_reached")
+    assert judge_flight(reached, True, None)[:2] == (ExitCode.GOAL_REACHED, "goal_reached")
+    assert judge_flight(reached, False, 0)[:2] == (ExitCode.NOT_REACHED, "not_landed")
+    assert judge_flight(reached, True, 2)[:2] == (ExitCode.NOT_REACHED, "contact")
+    safety = Ending("safety", ExitCode.SAFETY_ENDED, "safety ended the flight")
+    assert judge_flight(safety, True, 0)[:2] == (ExitCode.SAFETY_ENDED, "safety")
