@@ -27,6 +27,7 @@ HOLD_OFF_PER_S = 10.0  # speed outwards per metre inside; acts on the stop point
 POINT_BAND_M = 0.05  # hold off from points up to this far inside the hull; deeper is no drift
 FENCE_BAND_M = 0.5  # the same for the fence
 _LEAST_M = 1e-6
+_NO_NORMALS, _NO_SPEEDS = np.empty((2, 0)), np.empty(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +108,8 @@ def _outward(tube: Tubes, clear_m: Floats, points_m: Floats, position_m: Floats,
     depth_here = config.keep_out_m - slide - np.sqrt((here * here).sum(axis=0))
     depth = np.maximum(-clear_m - slide, depth_here)
     inside = depth > 0.0
+    if not inside.any():  # the usual case
+        return _NO_NORMALS, _NO_SPEEDS
     near_now, depth, points = (depth_here >= depth)[inside], depth[inside], points_m[:, inside]
     begin, stop = tube.turn_m[0, -1, :2, None], tube.stop_m[0, -1, :2, None]
     leg = stop - begin
@@ -120,6 +123,8 @@ def _outward(tube: Tubes, clear_m: Floats, points_m: Floats, position_m: Floats,
 def _axis_bounds(fence_m: Floats, config: SafetyConfig) -> tuple[Floats, Floats]:
     """Least and greatest command per axis [3]: the stop point reaches a face at most; beyond it, back inwards."""
     room = np.maximum(fence_m, 0.0) / stop_gain_s(config)
+    if not (fence_m < 0.0).any():  # the usual case
+        return -room[:3], room[3:]
     depth = -fence_m - SLIDE_SHARE * config.margin_m
     inward = np.where((depth > 0.0) & (depth <= FENCE_BAND_M), _hold_off_m_s(depth, config), 0.0)
     bound = np.where(inward > 0.0, -inward, room)

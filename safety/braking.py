@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from safety.messages import VehicleState
 
 Floats = NDArray[np.float64]
 HISTORY = 64
+_Triple = tuple[float, float, float]
 
 
 class CommandHistory:
@@ -63,9 +65,8 @@ class Start:
 
 @dataclass(frozen=True, slots=True)
 class Tubes:
-    """Brake tubes of c candidate commands: polylines begin -> turn -> stop, each [2 models, c, 3], corridor frame, m."""
+    """Brake tubes of c candidates: `turn_m` is the end of the tick, `stop_m` the standstill, [2 models, c, 3], corridor frame."""
 
-    begin_m: Floats
     turn_m: Floats
     stop_m: Floats
 
@@ -75,38 +76,41 @@ def predict_start(state: VehicleState, history: CommandHistory, now_s: float, co
     phases = history.phases(state.time_s - config.dead_time_s, now_s, state.velocity)
     position, velocity = np.empty((2, 3)), np.empty((2, 3))
     for row, lag_s in enumerate((config.lag_s, config.lag_min_s)):
-        p, v = state.position, state.velocity
-        for duration_s, command in phases:
-            p, v = _follow(p, v, command, lag_s, duration_s)
-        position[row] = (p.x, p.y, p.z)
-        velocity[row] = (v.x, v.y, v.z)
+        position[row], velocity[row] = _flown(state, phases, lag_s)
     return Start(position, velocity)
 
 
-def _follow(
-    p: CorridorVector, v: CorridorVector, command: CorridorVector, lag_s: float, duration_s: float
-) -> tuple[CorridorVector, CorridorVector]:
-    """One phase of a first-order velocity loop under a constant command."""
-    left = math.exp(-duration_s / lag_s)
-    gone = lag_s * (1.0 - left)
-    dx, dy, dz = v.x - command.x, v.y - command.y, v.z - command.z
-    position = CorridorVector(
-        p.x + command.x * duration_s + dx * gone,
-        p.y + command.y * duration_s + dy * gone,
-        p.z + command.z * duration_s + dz * gone,
-    )
-    return position, CorridorVector(command.x + dx * left, command.y + dy * left, command.z + dz * left)
+def _flown(state: VehicleState, phases: list[tuple[float, CorridorVector]], lag_s: float) -> tuple[_Triple, _Triple]:
+    """Position and velocity after the phases: a first-order velocity loop under one constant command after the other."""
+    px, py, pz = state.position.x, state.position.y, state.position.z
+    vx, vy, vz = state.velocity.x, state.velocity.y, state.velocity.z
+    for duration_s, command in phases:
+        left = math.exp(-duration_s / lag_s)
+        gone = lag_s * (1.0 - left)
+        dx, dy, dz = vx - command.x, vy - command.y, vz - command.z
+        px += command.x * duration_s + dx * gone
+        py += command.y * duration_s + dy * gone
+        pz += command.z * duration_s + dz * gone
+        vx, vy, vz = command.x + dx * left, command.y + dy * left, command.z + dz * left
+    return (px, py, pz), (vx, vy, vz)
+
+
+@lru_cache(maxsize=16)
+def _tick_response(lag_s: float, lag_min_s: float, tick_s: float) -> tuple[Floats, Floats]:
+    """Per model [2, 1, 1]: what is left of a velocity error after one tick, and its integral over the tick, s."""
+    lags = np.array((lag_s, lag_min_s))[:, None, None]
+    left = np.exp(-tick_s / lags)
+    return left, lags * (1.0 - left)
 
 
 def tubes(start: Start, candidates_m_s: Floats, config: SafetyConfig) -> Tubes:
     """Brake tubes of candidate velocity commands [c, 3] held for one tick from `start`."""
-    lags = np.array((config.lag_s, config.lag_min_s))[:, None, None]
-    left = np.exp(-config.tick_s / lags)
-    begin = np.broadcast_to(start.position_m[:, None, :], (2, *candidates_m_s.shape))
+    left, gone = _tick_response(config.lag_s, config.lag_min_s, config.tick_s)
+    begin = start.position_m[:, None, :]
     rest = start.velocity_m_s[:, None, :] - candidates_m_s
-    turn = begin + candidates_m_s * config.tick_s + rest * (lags * (1.0 - left))
+    turn = begin + candidates_m_s * config.tick_s + rest * gone
     velocity = candidates_m_s + rest * left
-    return Tubes(begin, turn, turn + velocity * _stop_times_s(velocity, config))
+    return Tubes(turn, turn + velocity * _stop_times_s(velocity, config))
 
 
 def _stop_times_s(velocity_m_s: Floats, config: SafetyConfig) -> Floats:

@@ -65,8 +65,7 @@ class Shield:
         """The wanted velocity itself when it is safe (same object), else the nearest safe candidate, else zero."""
         clearance, fence_margin = self._clearance_now(around), self._fence_margin(around.position)
         around = self._within_reach(around)
-        nothing = np.array((wanted.x, wanted.y, wanted.z))
-        first = np.stack((nothing, np.zeros(3)))
+        first = np.array(((wanted.x, wanted.y, wanted.z), (0.0, 0.0, 0.0)))
         found: list[Intervention] = []
         first[0] = self._view_capped(first[:1], around, clearance, fence_margin, found)[0]
         passed, brake = self._judge(first, around, found)
@@ -129,7 +128,7 @@ class Shield:
         """Judge the wanted command (row 0) against the allowance that braking (row 1) sets."""
         tube = tubes(around.start, first, self._config)
         clear, fence = self._tube_clearances(tube, around), self._tube_fence(tube)
-        points, position = np.stack((around.x_m, around.y_m)), np.array((around.position.x, around.position.y))
+        points, position = np.array((around.x_m, around.y_m)), np.array((around.position.x, around.position.y))
         allowed = allowance(tube, clear[1], fence[1], points, position, self._config)
         passed = bool(allowed.permits(first[:1], clear[:1], fence[:1])[0])
         if not passed:

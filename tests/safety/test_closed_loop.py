@@ -86,7 +86,7 @@ def towards(x, y, z):
     return policy
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("adversary", [bang, noise])
 def test_random_adversaries_among_pillars(adversary, seed):
     plant = Plant(x=1.0, boxes=np.array(WALLS + pillars(seed)), noise_m=0.01, seed=seed, lag_s=(0.35, 0.45, 0.6)[seed % 3])

@@ -1,0 +1,92 @@
+"""Cost of one `SafetyFilter.apply` with 180 beams: undisturbed flight, sliding along obstacles, and a braked fault.
+
+Times are the thread's own CPU time: on a shared machine the wall clock measures the neighbours.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import time
+from typing import Any
+
+import numpy as np
+
+from safety.config import Fence, SafetyConfig
+from safety.filter import SafetyFilter
+from safety.frames import CorridorVector
+from safety.messages import LidarScan, VehicleState, VelocityCommand
+
+TICKS = 3000
+WARM_UP = 200
+MEDIAN_LIMIT_US, P99_LIMIT_US = 500.0, 2000.0
+BEAMS = 180
+ZERO = CorridorVector(0.0, 0.0, 0.0)
+
+
+def _bearings() -> np.ndarray:
+    return -math.pi / 2 + math.pi / BEAMS * (np.arange(BEAMS) + 0.5)
+
+
+def _wall_ranges(random: np.random.Generator, y: float, wall_y: float, pillar: bool) -> np.ndarray:
+    """Ranges to a wall on either side, and to a wall across the way 0.7 m ahead when `pillar`."""
+    bearing = _bearings()
+    with np.errstate(divide="ignore"):
+        side = np.where(bearing > 0, wall_y - y, wall_y + y) / np.abs(np.sin(bearing))
+        ahead = np.where(pillar, 0.7, np.inf) / np.cos(bearing)
+    ranges = np.minimum(side, ahead) + 0.01 * random.standard_normal(BEAMS)
+    return np.where(ranges > 4.0, np.inf, np.maximum(ranges, 0.1)).astype(np.float32)
+
+
+def _ticks(case: str) -> list[tuple[VelocityCommand, VehicleState, LidarScan | None, float]]:
+    """The inputs of a flight along a corridor, made before the clock runs."""
+    random, result = np.random.default_rng(1), []
+    blocked = case == "intervening"
+    for k in range(TICKS + WARM_UP):
+        now = 0.05 * k
+        x = 10.0 + (0.0 if blocked else (0.05 * k) % 20.0)
+        state = VehicleState(
+            now, CorridorVector(x, 0.5, 2.0), CorridorVector(0.1 if blocked else 1.0, 0.0, 0.0), ZERO, 0.02, 0.03, 0.0, 0.0
+        )
+        ranges = _wall_ranges(random, 0.5, 1.2 if blocked else 3.0, blocked)
+        scan = None if case == "fault" else LidarScan(now, ranges, -math.pi / 2, math.pi / BEAMS, 0.1, 4.0)
+        result.append((VelocityCommand(CorridorVector(1.0, 0.3 if blocked else 0.0, 0.0), 0.1), state, scan, now))
+    return result
+
+
+def _costs_us(case: str) -> tuple[np.ndarray, int]:
+    """Cost of each call, us, and how many of them were interventions."""
+    safety = SafetyFilter(SafetyConfig(fence=Fence(min_m=(-1.0, -4.0, 0.3), max_m=(36.0, 4.0, 4.0))))
+    ticks, costs, touched = _ticks(case), [], 0
+    gc.collect()
+    gc.disable()  # as the control loop flies
+    for command, state, scan, now in ticks:
+        begin = time.thread_time_ns()
+        _, verdict = safety.apply(command, state, scan, now)
+        costs.append((time.thread_time_ns() - begin) / 1000.0)
+        touched += bool(verdict.interventions)
+    gc.enable()
+    return np.array(costs[WARM_UP:]), touched
+
+
+def run(json: bool) -> list[dict[str, Any]]:
+    """Median and 99th percentile per case against the limits of one tick's budget (500 us and 2 ms)."""
+    figures: list[dict[str, Any]] = []
+    for case in ("undisturbed", "intervening", "fault"):
+        costs, touched = _costs_us(case)
+        if not json:
+            print(f"{case}: {touched} of {TICKS + WARM_UP} calls intervened")
+        for name, share, limit in (("median", 50, MEDIAN_LIMIT_US), ("p99", 99, P99_LIMIT_US)):
+            value = float(np.percentile(costs, share))
+            figures.append(
+                {
+                    "name": f"safety filter, {case}, {name}",
+                    "value": round(value, 1),
+                    "unit": "us",
+                    "peer": limit,
+                    "ratio": round(value / limit, 3),
+                    "target": f"<= {limit:g} us",
+                    "ok": value <= limit,
+                }
+            )
+    return figures
