@@ -184,7 +184,7 @@ class LockstepFlight:
             shortest_path_m=max(0.0, shortest_m - SUCCESS_RADIUS_M),
             min_clearance_m=simulation.min_clearance_m,
             mean_jerk_m_s3=mean_jerk(np.array(watch.velocities)),
-            interventions=count_interventions(self.log),
+            interventions=count_interventions(self.log, reached_s),
         )
 
 
@@ -216,10 +216,10 @@ def mean_jerk(velocities: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(jerk, axis=1).mean())
 
 
-def count_interventions(log: FlightLog) -> dict[str, int]:
-    """Ticks in which each rule of the safety filter spoke."""
+def count_interventions(log: FlightLog, until_s: float = math.inf) -> dict[str, int]:
+    """Ticks up to `until_s` in which each rule of the safety filter spoke."""
     counts: dict[str, int] = {}
-    for record in log.records:
+    for record in (r for r in log.records if r.now_s <= until_s):
         for rule in {item.rule for item in record.verdict.interventions}:
             counts[rule] = counts.get(rule, 0) + 1
     return counts
