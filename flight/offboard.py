@@ -34,7 +34,8 @@ STILL = SafeCommand(CorridorVector(0.0, 0.0, 0.0), 0.0)
 SETPOINTS_BEFORE_OFFBOARD_S = 1.0
 STUCK_PROGRESS_M = 0.5
 LINK_LOST_S = 3.0
-SCAN_MARGIN_S = 0.004
+SCAN_MARGIN_S = 0.008
+ALIGNING_SCANS = 4
 MAX_STALLS = 3
 STALL_WINDOW_S = 5.0
 LOSS_CERTAINTY = 0.8
@@ -115,9 +116,20 @@ class OffboardFlight:
             self._status.stop_live()
 
     def _align_with_scans(self) -> None:
-        """Start the loop's grid a little after a scan came in: at equal rates every tick then finds one that is fresh."""
-        self._lidar.wait_for_scan(2.0 / LOOP_RATE_HZ)
-        time.sleep(SCAN_MARGIN_S)
+        """Start the loop's grid a little after scans come in: at equal rates every tick then finds one that is fresh.
+
+        The quickest of a few arrivals counts, so that one late wake-up does not shift the whole flight.
+        """
+        due_s = math.inf
+        for _ in range(ALIGNING_SCANS):
+            self.stay()
+            scan = self._lidar.wait_for_scan(2.0 / LOOP_RATE_HZ)
+            if scan is not None:
+                phase_s = (self._clock() + SCAN_MARGIN_S - scan.time_s) % (1.0 / LOOP_RATE_HZ)
+                due_s = min(due_s, phase_s)
+        scan = self._lidar.latest()
+        if scan is not None and math.isfinite(due_s):
+            time.sleep((scan.time_s + due_s - self._clock()) % (1.0 / LOOP_RATE_HZ))
         self.keeper.reset()
 
     def _step(self) -> Ending | None:
