@@ -62,6 +62,7 @@ def load_sb3(path: str | Path, layout: LayoutFile, options: Sb3Options | None = 
         problem = f"the policy takes {size} values, the layout describes {observation.size}"
         raise CheckpointError(f"{path}: {problem}; describe its observation in a YAML file and give it as --layout")
     hidden, layers = _memory(archive, shapes)
+    activation = _activation(archive, options, kwargs, shapes)
     actions, action = _actions(archive, shapes, layout, options, kwargs)
     config = Sb3Config(
         observation_size=size,
@@ -71,7 +72,7 @@ def load_sb3(path: str | Path, layout: LayoutFile, options: Sb3Options | None = 
         critic=_critic(shapes, layers),
         pi=_widths(archive, shapes, "policy_net"),
         vf=_widths(archive, shapes, "value_net"),
-        activation=_activation(archive, options, kwargs, shapes),
+        activation=activation,
         actions=actions,
         normalisation=None if options.statistics is None else Normalisation(*read_statistics(options.statistics, size)),
     )
@@ -190,11 +191,9 @@ def _actions(
     if count != len(entry.order):
         problem = f"the policy has {count} actions, the layout names {len(entry.order)} ({', '.join(entry.order)})"
         raise CheckpointError(f"{archive.path}: {problem}; name them in the --layout file under action.order")
-    low, high = _space(archive, options, count, entry.low is not None and entry.high is not None)
+    low, high = _space(archive, options, count)
     to_low = low if entry.low is None else np.array(entry.low)
     to_high = high if entry.high is None else np.array(entry.high)
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        low, high = to_low, to_high  # predict clips to nothing; the file clips to its own limits
     same = np.allclose(low, to_low, rtol=0.0, atol=1e-7) and np.allclose(high, to_high, rtol=0.0, atol=1e-7)
     if not same and not options.rescale_action:
         problem = f"the layout's action limits are not the action space's, {low.tolist()} to {high.tolist()}"
@@ -216,9 +215,7 @@ def _actions(
         raise CheckpointError(f"{archive.path}: action: {first_problem(error)[1]}; correct action in the --layout file") from None
 
 
-def _space(
-    archive: Sb3Archive, options: Sb3Options, count: int, layout_has_limits: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _space(archive: Sb3Archive, options: Sb3Options, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Limits of the action space that the policy was trained in."""
     space = archive.data.get("action_space")
     if isinstance(space, dict) and "Box" not in str(space.get(":type:", "Box")):
@@ -235,14 +232,9 @@ def _space(
         if stated is not None and not (np.allclose(low, stated[0]) and np.allclose(high, stated[1])):
             problem = f"the archive's action space is {stated[0].tolist()} to {stated[1].tolist()}"
             raise CheckpointError(f"--action-low, --action-high: {problem}; leave them out (another scale is given by --layout)")
-    finite = np.isfinite(low).all() and np.isfinite(high).all()
-    if not finite and not layout_has_limits:
-        problem = "its action space has no finite limits"
-        raise CheckpointError(
-            f"{archive.path}: {problem}; give those to be flown in the --layout file, action.low and action.high"
-        )
-    if finite and not (low < high).all():
-        raise CheckpointError(f"{archive.path}: every low of the action space must be below its high, not {low} .. {high}")
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+        problem = "limits must be finite and every low below its high"
+        raise CheckpointError(f"{archive.path}: action space {low.tolist()} .. {high.tolist()}: {problem}")
     return low, high
 
 
