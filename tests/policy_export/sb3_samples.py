@@ -104,11 +104,13 @@ def train(setting: Setting, folder: Path, steps: int = TRAINED_STEPS) -> Trained
     environment: Any = DummyVecEnv([lambda: Follow(setting.low, setting.high)] * 4)
     normaliser = VecNormalize(environment, clip_obs=5.0) if setting.normalised else None
     common = {"n_steps": 128, "batch_size": 256, "n_epochs": 1, "learning_rate": 3e-3, "seed": 1, "use_sde": setting.squash}
+    # SB3 starts with actions a hundred times smaller than the memory's output; so few steps would leave them constant.
+    kwargs = setting.kwargs | {"ortho_init": False}
     if setting.recurrent:
-        kwargs = {"lstm_hidden_size": 24} | setting.kwargs
+        kwargs |= {"lstm_hidden_size": 24}
         model: BaseAlgorithm = RecurrentPPO("MlpLstmPolicy", normaliser or environment, policy_kwargs=kwargs, **common)
     else:
-        model = PPO("MlpPolicy", normaliser or environment, policy_kwargs=setting.kwargs, **common)
+        model = PPO("MlpPolicy", normaliser or environment, policy_kwargs=kwargs, **common)
     model.learn(steps)
     archive = folder / "model.zip"
     model.save(archive)
