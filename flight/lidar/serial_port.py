@@ -11,7 +11,7 @@ from flight.lidar.transport import READ_BYTES, TransportError
 
 def _pyserial() -> ModuleType:
     try:
-        import serial  # type: ignore[import-untyped]  # noqa: PLC0415  (only serial devices need it)
+        import serial  # noqa: PLC0415  (only serial devices need it)
     except ImportError:
         raise TransportError("serial LiDARs need pyserial: pip install pyserial==3.5") from None
     module: ModuleType = serial

@@ -125,10 +125,10 @@ class TurnAssembler:
             self._clear()
         self._keep(points, time_s)
         whole = self._travel_rad - self._pieces[0].travel_rad[0] >= TURN - _MAX_SPREAD
-        due = self._travel_rad - self._delivered_rad >= TURN / self._config.scans_per_turn
-        if not (whole and due):
+        pace = TURN / self._config.scans_per_turn
+        if not (whole and self._travel_rad - self._delivered_rad >= pace):
             return None
-        self._delivered_rad = self._travel_rad
+        self._delivered_rad = pace * math.floor(self._travel_rad / pace)  # without slip, however the points come in
         return self._scan(motion)
 
     def _keep(self, points: Points, time_s: Floats) -> None:
