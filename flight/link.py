@@ -155,10 +155,26 @@ class VehicleLink:
         """The newest estimate in the corridor frame; None before the first complete one."""
         return self.telemetry.state(frame)
 
+    def subscribe(self, name: str, handler: Callable[[str, float, int], None]) -> None:
+        """Hand every message `name` of this vehicle to `handler`: fields (JSON), arrival (monotonic s), component id.
+
+        After `connect`. Called on MAVSDK's thread; it must neither block nor raise.
+        """
+
+        def forward(message: Any, _user_data: Any) -> None:
+            if message.system_id == self.system_id:
+                handler(message.fields_json, self._clock(), int(message.component_id))
+
+        self._direct.subscribe_message(name, forward)
+
+    def request_message_rate(self, name: str, rate_hz: float) -> None:
+        """Ask for one message at `rate_hz`. Raises `VehicleCommandError` when PX4 refuses."""
+        self.command_long(COMMAND_SET_MESSAGE_INTERVAL, MESSAGE_ID[name], 1e6 / rate_hz, what=f"the rate of {name}")
+
     def request_stream_rates(self, rate_hz: float = 50.0) -> None:
         """Ask for the messages the loop lives on at `rate_hz`. Raises `VehicleCommandError` when PX4 refuses."""
         for name in ("LOCAL_POSITION_NED", "ATTITUDE", "HIGHRES_IMU"):
-            self.command_long(COMMAND_SET_MESSAGE_INTERVAL, MESSAGE_ID[name], 1e6 / rate_hz, what=f"the rate of {name}")
+            self.request_message_rate(name, rate_hz)
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float, keep_alive: Callable[[], None] | None = None) -> bool:
         """Poll `condition` every 10 ms until it holds (True) or `timeout_s` passed (False)."""

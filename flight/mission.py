@@ -223,6 +223,8 @@ def load_mission(path: str | Path, seed: int | None = None) -> Mission:
     except ConfigError as error:
         raise MissionError(str(error)) from None
     updates: dict[str, object] = {"policy": mission.policy.model_copy(update={"path": _resolve(file, mission.policy.path)})}
+    if mission.lidar.path is not None:
+        updates["lidar"] = mission.lidar.model_copy(update={"path": _resolve(file, mission.lidar.path)})
     if mission.sim is not None:
         sim: dict[str, object] = {"world": _resolve(file, mission.sim.world)}
         if seed is not None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 from flight.errors import ExitCode, VehicleCommandError
 from flight.interrupt import Interrupt
-from flight.lidar.driver import ScipDriver
+from flight.lidar.driver import LidarDriver
 from flight.link import VehicleLink
 from flight.mission import Mission
 from flight.preflight import LOOP_RATE_HZ
@@ -58,7 +58,7 @@ class OffboardFlight:
     def __init__(
         self,
         link: VehicleLink,
-        lidar: ScipDriver,
+        lidar: LidarDriver,
         pilot: Pilot,
         frame: CorridorFrame,
         mission: Mission,

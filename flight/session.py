@@ -20,7 +20,8 @@ from flight.errors import ExitCode, MissionError, RefusedError, VehicleCommandEr
 from flight.gateway_process import GatewayProcess, GatewayReady
 from flight.interrupt import Interrupt
 from flight.landing import Landing
-from flight.lidar import ScipDriver, open_lidar
+from flight.lidar import LidarDriver, body_motion, open_lidar
+from flight.lidar.from_link import feed_from_link
 from flight.link import VehicleLink, check_port_is_free
 from flight.mission import Mission, goal_problem, takeoff_point_problem
 from flight.offboard import Ending, OffboardFlight
@@ -98,7 +99,9 @@ class FlightSession:
             self._connect(link, lidar)
             self._preflight(link, lidar, policy, place)
             frame = self._anchor(link, place)
-            pilot = Pilot(policy, SafetyFilter(self._mission.safety), place.goal, self._mission.goal.radius_m)
+            lidar.follow(lambda: body_motion(link.state(frame)))
+            level = self._mission.lidar.tilt_compensation
+            pilot = Pilot(policy, SafetyFilter(self._mission.safety), place.goal, self._mission.goal.radius_m, level_scans=level)
             flight = OffboardFlight(link, lidar, pilot, frame, self._mission, self._interrupt, self._status)
             ending, landed = self._fly(link, flight, frame)
             link.close()
@@ -160,11 +163,12 @@ class FlightSession:
     def _lidar_source(self) -> Any:
         return self._mission.lidar.model_copy(update={"host": "127.0.0.1"}) if self._mission.simulated else self._mission.lidar
 
-    def _connect(self, link: VehicleLink, lidar: ScipDriver) -> None:
+    def _connect(self, link: VehicleLink, lidar: LidarDriver) -> None:
         timeouts, source = self._mission.timeouts, self._mission.lidar
         self._status.phase(f"connecting to the vehicle on {link.url}")
         link.connect(timeouts.connect_s, self._interrupt.check)
-        self._status.phase(f"vehicle {link.system_id} answers; waiting for the LiDAR on {source.host}:{source.port}")
+        feed_from_link(lidar, source, link)
+        self._status.phase(f"vehicle {link.system_id} answers; waiting for the LiDAR on {source.place}")
         deadline = time.monotonic() + timeouts.lidar_s
         while lidar.health().scans < ANCHOR_SAMPLES:
             self._interrupt.check()
@@ -172,12 +176,12 @@ class FlightSession:
                 health = lidar.health()
                 reason = f" ({health.last_error})" if health.last_error else ""
                 raise RefusedError(
-                    f"LiDAR not answering on {source.host}:{source.port} within {timeouts.lidar_s:g} s{reason}: check that it is "
-                    "powered and `lidar.host` and `lidar.port` in the mission"
+                    f"LiDAR not answering on {source.place} within {timeouts.lidar_s:g} s{reason}: check that it is "
+                    f"powered and {source.advice} in the mission"
                 )
             lidar.wait_for_scan(0.2)
 
-    def _preflight(self, link: VehicleLink, lidar: ScipDriver, policy: PolicyRunner, place: Place) -> None:
+    def _preflight(self, link: VehicleLink, lidar: LidarDriver, policy: PolicyRunner, place: Place) -> None:
         mission = self._mission
         link.request_stream_rates(mission.vehicle.stream_rate_hz)
         self._wait(lambda: link.telemetry.imu is not None and link.telemetry.position is not None, link, mission.timeouts.ready_s)

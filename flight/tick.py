@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flight.lidar.reduce import BeamReducer, fill_unknown
+from flight.lidar.reduce import BeamReducer, fill_unknown, levelled
 from policy_export.errors import PolicyInputError, PolicyOutputError
 from policy_export.observation import ObservationBuilder
 from policy_export.runner import PolicyRunner
@@ -63,6 +63,7 @@ class Pilot:
         goal: CorridorVector,
         goal_radius_m: float,
         *,
+        level_scans: bool = False,
         timer: Callable[[], float] = time.perf_counter,
     ) -> None:
         if not (_finite(goal) and 0.0 < goal_radius_m < math.inf):
@@ -72,6 +73,7 @@ class Pilot:
         self.goal_radius_m = goal_radius_m
         self._policy = policy
         self._safety = safety
+        self._level_scans = level_scans
         self._timer = timer
         self._limits = safety.config
         self._in_heading_frame = policy.metadata.action.frame == "heading"
@@ -142,7 +144,7 @@ class Pilot:
             return None
         if not -limits.future_tolerance_s <= now_s - state.time_s <= limits.state_stale_s:
             return None
-        ranges = self._reducer.reduce(scan)
+        ranges = self._reducer.reduce(levelled(scan, state.roll_rad, state.pitch_rad) if self._level_scans else scan)
         return None if np.isnan(ranges).all() else fill_unknown(ranges, self._reducer.range_max_m)
 
     def _decide(

@@ -29,6 +29,8 @@ sim-gateway --world configs/worlds/corridor.yaml --seed 7 --wind 1,0.5,0 --repor
 
 sim-gateway --world configs/worlds/paper.yaml --onboard-port 14541 --lidar-port 10941 --gcs-port 0
 
+sim-gateway --world configs/worlds/corridor.yaml --serial-lidar ld06 --serial-link /tmp/lidar
+
 Then connect a MAVSDK client to udpin://127.0.0.1:14540 and a Hokuyo SCIP driver to 127.0.0.1:10940.
 """
 _HIGHEST_PORT = 65535 - 4020  # the gateway's own ports lie up to this far above the client's
@@ -50,6 +52,14 @@ class Estimate(StrEnum):
     px4_sih = "px4_sih"
 
 
+class SerialKind(StrEnum):
+    """Spinning LiDARs on a serial line."""
+
+    ld06 = "ld06"
+    stl27l = "stl27l"
+    rplidar = "rplidar"
+
+
 class _UsageError(Exception):
     """A mistake of the user's; one line that says what to change."""
 
@@ -67,6 +77,8 @@ def serve(
     onboard_port: Annotated[int, typer.Option(min=1, max=_HIGHEST_PORT, help="UDP port of the onboard client.")] = 14540,
     gcs_port: Annotated[int, typer.Option(min=0, max=_HIGHEST_PORT, help="UDP port of the ground station; 0: none.")] = 14550,
     lidar_port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the LiDAR; 0: any free one.")] = 10940,
+    serial_lidar: Annotated[SerialKind | None, typer.Option(help="Also a spinning LiDAR on a pseudo-terminal.")] = None,
+    serial_link: Annotated[Path | None, typer.Option(help="Symbolic link to that pseudo-terminal.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write the true path, contacts and events here (JSON).")] = None,
     speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Vehicle seconds per second.")] = 1.0,
     max_time: Annotated[float, typer.Option(min=0.0, help="Stop after this many vehicle seconds; 0: never.")] = 0.0,
@@ -94,6 +106,8 @@ def serve(
         speed=speed,
         max_time_s=max_time or math.inf,
         report=report,
+        serial_lidar=serial_lidar.value if serial_lidar is not None else None,
+        serial_link=serial_link,
     )
     _serve(scene, config, quit_with_parent)
 
@@ -115,6 +129,8 @@ def _serve(world: World, config: GatewayConfig, quit_with_parent: bool) -> None:
         raise _UsageError(f"{error}: stop the program there, or choose another with --onboard-port or --gcs-port") from None
     except ScipServerError as error:
         raise _UsageError(f"{error} with --lidar-port") from None
+    except FileExistsError:
+        raise _UsageError(f"--serial-link {config.serial_link} exists and is not a link: choose another name") from None
     with gateway:
         print(json.dumps(gateway.ready_message()), flush=True)
         logging.getLogger("sim_gateway").info(

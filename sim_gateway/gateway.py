@@ -17,6 +17,7 @@ from sim_gateway.mavlink_server import MavlinkServer
 from sim_gateway.piloted import PilotedVehicle
 from sim_gateway.scene import Point, World
 from sim_gateway.scip import DEFAULT_PORT, ScipServer
+from sim_gateway.serial_lidar import SerialLidar
 from sim_gateway.simulation import Simulation, WindConfig, step_at
 from sim_gateway.telemetry import Telemetry
 from sim_gateway.vehicle import STEP_S
@@ -32,7 +33,10 @@ _log = logging.getLogger("sim_gateway")
 
 @dataclass(frozen=True, slots=True)
 class GatewayConfig:
-    """How to run. Ports are those the clients use; `gcs_port` 0 leaves that link out, `lidar_port` 0 takes a free one."""
+    """How to run. Ports are those the clients use; `gcs_port` 0 leaves that link out, `lidar_port` 0 takes a free one.
+
+    `serial_lidar`: also a spinning LiDAR of this kind (`serial_lidar.KINDS`) on a pseudo-terminal, `serial_link` a name for it.
+    """
 
     seed: int = 0
     onboard_port: int = 14540
@@ -44,6 +48,8 @@ class GatewayConfig:
     speed: float = 1.0
     max_time_s: float = math.inf
     report: Path | None = None
+    serial_lidar: str | None = None
+    serial_link: Path | None = None
 
 
 def _simulation(world: World, config: GatewayConfig) -> Simulation:
@@ -69,10 +75,10 @@ class Gateway:
         self.vehicle = PilotedVehicle(_simulation(world, config), heading_rad=config.heading_rad)
         pilot, frame = self.vehicle.autopilot, self.vehicle.frame
         self.recorder = FlightRecorder(self.vehicle.simulation, self._facts())
-        telemetry = Telemetry(pilot, frame, self.vehicle.snapshot, lambda: self.vehicle.time_s)
+        self.telemetry = Telemetry(pilot, frame, self.vehicle.snapshot, lambda: self.vehicle.time_s)
         onboard = (config.onboard_port + ONBOARD_PORT_OFFSET, config.onboard_port)
         ground = (config.gcs_port + GROUND_PORT_OFFSET, config.gcs_port) if config.gcs_port else None
-        self.server = MavlinkServer(pilot, frame, telemetry, onboard, ground)
+        self.server = MavlinkServer(pilot, frame, self.telemetry, onboard, ground)
         self.lidar = ScipServer(lambda: self.vehicle.time_s, config.lidar_port)
         self.dropped_s = 0.0
         self._started_s = math.nan
@@ -80,7 +86,9 @@ class Gateway:
         self._was_armed = False
         try:
             self.lidar.start()
+            self.serial_lidar = SerialLidar(config.serial_lidar, config.serial_link, config.seed) if config.serial_lidar else None
         except Exception:
+            self.lidar.stop()
             self.server.close()
             raise
 
@@ -93,6 +101,8 @@ class Gateway:
     def close(self) -> None:
         """Free all ports."""
         self.lidar.stop()
+        if self.serial_lidar is not None:
+            self.serial_lidar.close()
         self.server.close()
 
     def ready_message(self) -> dict[str, Any]:
@@ -103,6 +113,7 @@ class Gateway:
             "onboard_port": config.onboard_port,
             "gcs_port": config.gcs_port,
             "lidar_port": self.lidar.port,
+            "serial_lidar": self.serial_lidar.path if self.serial_lidar is not None else None,
             "start": list(world.start),
             "start_yaw_rad": world.start_yaw_rad,
             "goal": list(world.goal),
@@ -140,10 +151,13 @@ class Gateway:
         vehicle = self.vehicle
         vehicle.advance(1)
         self.recorder.watch()
+        if self.serial_lidar is not None:
+            self.serial_lidar.advance(vehicle.simulation)
         if vehicle.simulation.steps >= step_at(self._scans * 0.05):
             self._scans += 1
             scan = vehicle.simulation.scan()
             self.lidar.publish(scan.time_s, scan.ranges_m)
+            self.telemetry.scan = scan
         self.server.poll()
         self._note_changes()
 

@@ -16,7 +16,9 @@ from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.autopilot import Autopilot
 from sim_gateway.local_frame import LocalFrame, Vector
+from sim_gateway.obstacle_distance import obstacle_distance
 from sim_gateway.setpoints import OffboardSetpoint
+from sim_gateway.simulation import Scan
 
 Message = Any  # pymavlink publishes no types
 Quaternion = tuple[float, float, float, float]
@@ -43,6 +45,7 @@ STREAM_RATES_HZ: dict[str, tuple[float, float]] = {
     "HOME_POSITION": (0.5, 0.5),
     "LOCAL_POSITION_NED": (30, 50),
     "MISSION_CURRENT": (1, 1),
+    "OBSTACLE_DISTANCE": (0, 0),
     "ODOMETRY": (30, 0),
     "PING": (1, 0.1),
     "POSITION_TARGET_LOCAL_NED": (10, 50),
@@ -105,7 +108,10 @@ def _clamp_int(value: float, low: int, high: int) -> int:
 
 
 class Telemetry:
-    """Builds messages for the vehicle's present state. `snapshot` is called once per message, `now_s` gives vehicle time."""
+    """Builds messages for the vehicle's present state. `snapshot` is called once per message, `now_s` gives vehicle time.
+
+    `scan`: the newest scan, set by who has the LiDAR; OBSTACLE_DISTANCE tells of it.
+    """
 
     def __init__(
         self, autopilot: Autopilot, frame: LocalFrame, snapshot: Callable[[], Snapshot], now_s: Callable[[], float]
@@ -115,6 +121,7 @@ class Telemetry:
         self._frame = frame
         self._snapshot = snapshot
         self._sequence = 0
+        self.scan: Scan | None = None
         self._builders: dict[str, Callable[[Snapshot], Message]] = {
             name: getattr(self, f"_{name.lower()}") for name in (*STREAM_RATES_HZ, "AUTOPILOT_VERSION")
         }
@@ -125,7 +132,9 @@ class Telemetry:
         return self._names.get(message_id)
 
     def available(self, name: str) -> bool:
-        """Whether start-up has come far enough for this message."""
+        """Whether start-up has come far enough for this message, and what it tells of is there."""
+        if name == "OBSTACLE_DISTANCE" and self.scan is None:
+            return False
         return self.now_s() >= _FROM_S.get(name, LOCAL_FROM_S)
 
     def build(self, name: str) -> Message:
@@ -273,6 +282,10 @@ class Telemetry:
         return mav.MAVLink_distance_sensor_message(self._msec(now), 0, 10000, centimetres, 0, 0, 25, 0)
 
     # ---- sensors
+
+    def _obstacle_distance(self, _: Snapshot) -> Message:
+        assert self.scan is not None  # see available
+        return obstacle_distance(self.scan)
 
     def _gps_raw_int(self, now: Snapshot) -> Message:
         latitude, longitude, altitude = self._frame.to_global(now.position)

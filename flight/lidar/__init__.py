@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from flight.lidar.config import LidarSource
-from flight.lidar.driver import LidarHealth, ScipDriver
+from flight.lidar.devices import open_lidar
+from flight.lidar.driver import LidarDriver, LidarHealth
+from flight.lidar.motion import BodyMotion, body_motion
+from flight.lidar.recording import ScanSource
 from flight.lidar.reduce import BeamReducer, fill_unknown
 
-__all__ = ["BeamReducer", "LidarHealth", "LidarSource", "ScipDriver", "fill_unknown", "open_lidar"]
-
-
-def open_lidar(config: LidarSource) -> ScipDriver:
-    """The driver that `config` names, not yet started: use it as a context manager or call `start` and `close`."""
-    return ScipDriver(config)
+__all__ = [
+    "BeamReducer",
+    "BodyMotion",
+    "LidarDriver",
+    "LidarHealth",
+    "LidarSource",
+    "ScanSource",
+    "body_motion",
+    "fill_unknown",
+    "open_lidar",
+]

@@ -26,6 +26,13 @@ _BUCKET_S = 0.2
 _BUCKETS = 10
 
 
+ONE_WAY_DRIFT = 0.005
+"""Largest believed rate error where the device cannot be asked for its clock: some run on an RC oscillator."""
+
+MAX_JUMP_S = 1.0
+"""A device's clock that steps this far from ours between two frames was set anew."""
+
+
 class DeviceClockError(ValueError):
     """The device's clock ran backwards or stood still for a while: its offset must be measured again."""
 
@@ -102,3 +109,47 @@ class DeviceClock:
         if unexplained_s > MAX_UNEXPLAINED_S:
             raise DeviceClockError(f"scans come {1e3 * unexplained_s:.0f} ms later than the device's clock explains")
         return min(self._offset_s + min(smallest - self._baseline_s, allowed), smallest)
+
+
+class OneWayClock:
+    """The clock of a device that only sends: seconds of ours for its stamps, by the smallest (arrival - stamp) seen.
+
+    A smaller difference counts at once: it makes scans older, which is safe. A larger one is followed at `ONE_WAY_DRIFT`
+    only: enough for any oscillator, while a link that turns slow shows up as age for long enough to end the flight.
+    What remains is the least delay ever seen, which no listener can know.
+    """
+
+    def __init__(self, wrap_s: float = math.inf) -> None:
+        """`wrap_s`: the stamps start again from 0 here."""
+        self._wrap_s = wrap_s
+        self._stamp_s = math.nan
+        self._device_s = 0.0
+        self._arrived_s = math.nan
+        self._offset_s = math.inf
+        self._first_offset_s = math.nan
+
+    @property
+    def drift_s(self) -> float:
+        """How far the device's clock is believed to have moved since the first frame."""
+        return 0.0 if math.isnan(self._first_offset_s) else self._offset_s - self._first_offset_s
+
+    def measured_at(self, stamp_s: float, arrived_s: float) -> float:
+        """Monotonic time, s, of a stamp whose frame began to arrive at `arrived_s`; never later than that.
+
+        Raises `DeviceClockError` when the device's clock was set anew.
+        """
+        if math.isnan(self._stamp_s):
+            self._device_s, self._first_offset_s = stamp_s, arrived_s - stamp_s
+            passed_s = 0.0
+        else:
+            passed_s = max(0.0, arrived_s - self._arrived_s)
+            step_s = stamp_s - self._stamp_s
+            if math.isfinite(self._wrap_s):
+                step_s = (step_s + MAX_JUMP_S) % self._wrap_s - MAX_JUMP_S
+            if not abs(step_s - passed_s) <= MAX_JUMP_S:
+                raise DeviceClockError(f"the device's clock moved {step_s:.2f} s while {passed_s:.2f} s passed")
+            self._device_s += step_s
+        self._stamp_s = stamp_s
+        self._arrived_s = arrived_s if math.isnan(self._arrived_s) else self._arrived_s + passed_s
+        self._offset_s = min(arrived_s - self._device_s, self._offset_s + ONE_WAY_DRIFT * passed_s)
+        return min(self._device_s + self._offset_s, arrived_s)

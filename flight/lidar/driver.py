@@ -1,7 +1,6 @@
-"""SCIP 2.x driver: a thread that connects, reads the device's geometry and clock, streams, and reconnects.
+"""The LiDAR driver: a thread that opens a session with the device, takes its scans, and reconnects with back-off.
 
-The newest scan wins: `latest()` never waits and never queues. A scan's time is when the device measured it (step 0),
-mapped to the monotonic clock, not when it arrived.
+The newest scan wins: `latest()` never waits and never queues. What differs between devices is in their sessions.
 """
 
 from __future__ import annotations
@@ -11,25 +10,30 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Self
 
-from flight.lidar import scip
-from flight.lidar.clock import DeviceClock, DeviceClockError
+from flight.lidar.clock import DeviceClockError
 from flight.lidar.config import LidarSource
-from flight.lidar.reduce import Mounting
-from flight.lidar.transport import TcpTransport, Transport, TransportError
+from flight.lidar.inbox import Inbox
+from flight.lidar.motion import BodyMotion
+from flight.lidar.recording import RecordingError
+from flight.lidar.rplidar import RplidarError
+from flight.lidar.scip import ScipError
+from flight.lidar.session import Host, NoMoreScansError, Session
+from flight.lidar.transport import TransportError
 from safety.messages import LidarScan
 
 _log = logging.getLogger(__name__)
 
-CLOCK_READINGS = 8
+BREAKS = (TransportError, ScipError, RplidarError, DeviceClockError, RecordingError)
+"""Errors that end a session but not the driver."""
+
+OpenSession = Callable[[Host], Session]
+
 _RATE_WINDOW = 40
-_POLL_S = 0.1
-_DRAINED_REPLIES = 64
-_QUIT_TIMEOUT_S = 0.2
 _CLOSE_TIMEOUT_S = 3.0
 
 
@@ -57,25 +61,22 @@ class LidarHealth:
 _UNKNOWN = LidarHealth(False, math.nan, math.nan, 0, 0, 0, 0, math.inf, 0.0, "", "")
 
 
-class ScipDriver:
-    """A Hokuyo SCIP 2.x device as a source of `LidarScan`. Context manager; `start` and `close` are idempotent.
+class LidarDriver:
+    """A device as a source of `LidarScan`. Context manager; `start` and `close` are idempotent.
 
-    `connect` opens the transport (replaceable for other links), `clock` gives monotonic seconds.
+    `open_session` opens the link and gives the session for it; `clock` gives monotonic seconds. `inbox`: where messages for
+    a device behind another link (MAVLink) are put.
     """
 
-    def __init__(
-        self,
-        config: LidarSource,
-        connect: Callable[[LidarSource], Transport] | None = None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, config: LidarSource, open_session: OpenSession, clock: Callable[[], float] = time.monotonic) -> None:
+        self.inbox = Inbox()
         self._config = config
-        self._connect = connect or _connect_tcp
+        self._open_session = open_session
         self._clock = clock
         self._fresh = threading.Condition()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._transport: Transport | None = None
+        self._motion: Callable[[], BodyMotion | None] = _motion_unknown
         self._scan: LidarScan | None = None
         self._health = _UNKNOWN
         self._connections = 0
@@ -99,6 +100,10 @@ class ScipDriver:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+    def follow(self, motion: Callable[[], BodyMotion | None]) -> None:
+        """Where to ask for the vehicle's motion, for drivers that take it out of their scans; called on the driver's thread."""
+        self._motion = motion
 
     def latest(self) -> LidarScan | None:
         """The newest scan, or None before the first. Its age is the caller's to judge."""
@@ -126,8 +131,11 @@ class ScipDriver:
             scans_before = self._health.scans
             try:
                 self._stream_until_broken()
-            except (TransportError, scip.ScipError, DeviceClockError) as error:
+            except BREAKS as error:
                 self._note_broken(str(error))
+            except NoMoreScansError as end:
+                self._note_broken(str(end))
+                break
             if self._health.scans > scans_before:
                 pause_s = self._config.reconnect_min_s
             self._stop.wait(pause_s)
@@ -137,37 +145,38 @@ class ScipDriver:
             self._fresh.notify_all()
 
     def _stream_until_broken(self) -> None:
-        transport = self._connect(self._config)
+        host = Host(self._config, self._clock, self._stop, self._count_bad, self.inbox, self._motion_now)
+        session = self._open_session(host)
         try:
-            session = _ScipSession(transport, self._config, self._clock, self._stop, self._count_bad)
-            parameters = session.open()
-            self._note_connected(parameters, session.clock)
+            self._note_connected(session.open(), session)
             for scan in session.scans():
-                self._publish(scan, session.clock)
+                self._publish(scan, session)
             session.quit()
         finally:
-            transport.close()
+            session.close()
 
-    def _publish(self, scan: LidarScan, clock: DeviceClock) -> None:
+    def _motion_now(self) -> BodyMotion | None:
+        return self._motion()
+
+    def _publish(self, scan: LidarScan, session: Session) -> None:
         with self._fresh:
             self._scan = replace(scan, sequence=self._health.scans)
             self._measured.append(scan.time_s)
-            self._health = replace(self._health, scans=self._health.scans + 1, clock_drift_s=clock.drift_s)
+            self._health = replace(self._health, scans=self._health.scans + 1, clock_drift_s=session.clock_drift_s)
             self._fresh.notify_all()
 
-    def _note_connected(self, parameters: scip.ScipParameters, clock: DeviceClock) -> None:
+    def _note_connected(self, model: str, session: Session) -> None:
         self._connections += 1
-        reconnects = self._connections - 1
         with self._fresh:
             self._measured.clear()
             self._health = replace(
                 self._health,
                 connected=True,
-                reconnects=reconnects,
-                model=parameters.model,
-                clock_uncertainty_s=clock.uncertainty_s,
+                reconnects=self._connections - 1,
+                model=model,
+                clock_uncertainty_s=session.clock_uncertainty_s,
             )
-        _log.info("LiDAR %s: %d beams, clock within %.1f ms", parameters.model, parameters.beams, 1e3 * clock.uncertainty_s)
+        _log.info("LiDAR on %s: %s", self._config.place, model)
 
     def _note_broken(self, why: str) -> None:
         if why != self._health.last_error or self._health.connected:
@@ -181,144 +190,5 @@ class ScipDriver:
             self._health = replace(health, bad_checksums=health.bad_checksums + checksums, bad_frames=health.bad_frames + frames)
 
 
-def _connect_tcp(config: LidarSource) -> Transport:
-    return TcpTransport(config.host, config.port, config.connect_timeout_s)
-
-
-class _ScipSession:
-    """One connection: handshake, clock, stream. Ends by an exception (broken) or by the stop event."""
-
-    def __init__(
-        self,
-        transport: Transport,
-        config: LidarSource,
-        clock: Callable[[], float],
-        stop: threading.Event,
-        count_bad: Callable[[int, int], None],
-    ) -> None:
-        self.clock = DeviceClock()
-        self._transport = transport
-        self._config = config
-        self._now = clock
-        self._stop = stop
-        self._count_bad = count_bad
-        self._reader = scip.ReplyReader()
-        self._reported = (0, 0)
-        self._pending: deque[scip.Reply] = deque(maxlen=_DRAINED_REPLIES)
-        self._parameters: scip.ScipParameters | None = None
-
-    def open(self) -> scip.ScipParameters:
-        """Silence the device, read its geometry, fit its clock. The stream is not started yet."""
-        self._ask("QT")
-        self._parameters = scip.decode_parameters(self._ask("PP"))
-        self._fit_clock()
-        return self._parameters
-
-    def quit(self) -> None:
-        """Stop stream and laser. Waits a moment for the answer: closing on unread data could overtake the request."""
-        self._transport.write(scip.request("QT"), _QUIT_TIMEOUT_S)
-        deadline_s = self._now() + _QUIT_TIMEOUT_S
-        while self._now() < deadline_s and not any(reply.echo == "QT" for reply in self._pending):
-            self._receive(_QUIT_TIMEOUT_S / 4.0)
-
-    def scans(self) -> Iterator[LidarScan]:
-        """Start the stream and give its scans until the driver stops. Raises when the device stalls or the link breaks."""
-        parameters = self._parameters
-        if parameters is None:
-            raise scip.ScipError("the session is not open")
-        mounting = Mounting(self._config, parameters.angle_min_rad, parameters.angle_increment_rad, parameters.beams)
-        sent = scip.stream_request(parameters.first_step, parameters.last_step)
-        self._transport.write(sent, self._config.reply_timeout_s)
-        newest_s = -math.inf
-        deadline_s = self._now() + self._config.stall_timeout_s
-        while not self._stop.is_set():
-            scan = self._read_scan(sent, parameters, mounting)
-            if scan is not None and scan.time_s > newest_s:
-                newest_s = scan.time_s
-                deadline_s = self._now() + self._config.stall_timeout_s
-                yield scan
-            elif scan is not None:
-                self._count_bad(0, 1)  # not newer than the last: its clock or its data stands still
-            if self._now() > deadline_s:
-                raise TransportError(f"the LiDAR sent no good scan for {self._config.stall_timeout_s:g} s")
-
-    def _read_scan(self, sent: bytes, parameters: scip.ScipParameters, mounting: Mounting) -> LidarScan | None:
-        """The newest good scan of what has arrived; None when there is none yet."""
-        if not self._pending:
-            self._receive(min(_POLL_S, self._config.stall_timeout_s))
-        received_s = self._now()
-        newest: scip.ScipScan | None = None
-        measured_s = math.nan
-        while self._pending:
-            scan = self._decode(self._pending.popleft(), sent, parameters)
-            if scan is not None:
-                newest, measured_s = scan, self.clock.measured_at(scan.timestamp_ms, received_s)
-        return None if newest is None else self._to_vehicle(newest, measured_s, parameters, mounting)
-
-    def _decode(self, reply: scip.Reply, sent: bytes, parameters: scip.ScipParameters) -> scip.ScipScan | None:
-        if reply.status == scip.STATUS_OK and not reply.lines:
-            return None  # the stream's acknowledgement
-        if reply.status == scip.STATUS_UNSTABLE:
-            return None  # the device says: skip this one, go on
-        try:
-            return scip.decode_scan(reply, sent, parameters.beams)
-        except scip.ScipChecksumError:
-            self._count_bad(1, 0)
-        except scip.ScipError:
-            self._count_bad(0, 1)
-        return None
-
-    def _to_vehicle(
-        self, scan: scip.ScipScan, measured_s: float, parameters: scip.ScipParameters, mounting: Mounting
-    ) -> LidarScan:
-        range_max_mm = parameters.range_max_mm
-        if self._config.range_max_m is not None:
-            range_max_mm = min(range_max_mm, round(1e3 * self._config.range_max_m))
-        ranges = scip.ranges_from_values(scan.values_mm, parameters.range_min_mm, range_max_mm)
-        return LidarScan(
-            time_s=measured_s,
-            ranges_m=mounting.apply(ranges),
-            angle_min_rad=mounting.angle_min_rad,
-            angle_increment_rad=mounting.angle_increment_rad,
-            range_min_m=1e-3 * parameters.range_min_mm,
-            range_max_m=1e-3 * range_max_mm,
-        )
-
-    def _fit_clock(self) -> None:
-        self._ask("TM", "0")
-        for _ in range(CLOCK_READINGS):
-            sent_s = self._now()
-            reply = self._ask("TM", "1")
-            self.clock.synchronise(scip.decode_clock(reply), sent_s, self._now())
-        self._ask("TM", "2")
-
-    def _ask(self, code: str, parameters: str = "") -> scip.Reply:
-        """Send one request and give its reply; scans still under way are dropped. Raises if it takes too long."""
-        wanted = code + parameters
-        self._transport.write(scip.request(code, parameters), self._config.reply_timeout_s)
-        deadline_s = self._now() + self._config.reply_timeout_s
-        while not self._stop.is_set():
-            while self._pending:
-                reply = self._pending.popleft()
-                if reply.echo == wanted:
-                    return _accepted(reply)
-            remaining_s = deadline_s - self._now()
-            if remaining_s <= 0.0:
-                raise TransportError(f"the LiDAR did not answer {wanted} within {self._config.reply_timeout_s:g} s")
-            self._receive(min(remaining_s, _POLL_S))
-        raise TransportError("the driver was closed")
-
-    def _receive(self, timeout_s: float) -> None:
-        self._pending.extend(self._reader.feed(self._transport.read(timeout_s)))
-        counted = (self._reader.bad_checksums, self._reader.bad_frames)
-        if counted != self._reported:
-            self._count_bad(counted[0] - self._reported[0], counted[1] - self._reported[1])
-            self._reported = counted
-
-
-def _accepted(reply: scip.Reply) -> scip.Reply:
-    """The reply if the device did as asked. TM0 answers 02 and TM2 03 when it was in that state already."""
-    already = {"TM0": "02", "TM2": "03"}.get(reply.echo)
-    if reply.status in (scip.STATUS_OK, already):
-        return reply
-    raise scip.ScipError(f"the LiDAR refused {reply.echo} with status {reply.status}")
+def _motion_unknown() -> BodyMotion | None:
+    return None

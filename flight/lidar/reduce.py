@@ -7,6 +7,7 @@ the device can measure". Missing is never turned into far here.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ class Mounting:
         self._mirror = config.mirror
         self._offset = (config.mount_x_m, config.mount_y_m)
         self._bearings: NDArray[np.float64] = self.angle_min_rad + angle_increment_rad * np.arange(beams, dtype=np.float64)
-        self._blind = _blind_beams(config.blind_sectors_deg, self._bearings)
+        self._blind = in_sectors(self._bearings, config.blind_sectors_deg)
 
     def apply(self, ranges_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """float32 [beams] in device order to float32 [beams] by increasing vehicle bearing."""
@@ -42,7 +43,8 @@ class Mounting:
         return _seen_from_centre(ranges, self._bearings, self._offset, self.angle_increment_rad)
 
 
-def _blind_beams(sectors_deg: tuple[tuple[float, float], ...], bearings: NDArray[np.float64]) -> NDArray[np.bool_]:
+def in_sectors(bearings: NDArray[np.float64], sectors_deg: tuple[tuple[float, float], ...]) -> NDArray[np.bool_]:
+    """Which bearings [n], rad, lie in one of the sectors [from, to], degrees, counter-clockwise."""
     blind = np.zeros(bearings.shape, dtype=bool)
     for start_deg, stop_deg in sectors_deg:
         width_rad = math.radians((stop_deg - start_deg) % 360.0)
@@ -117,6 +119,19 @@ class BeamReducer:
         for row, selected in zip(self._members, member, strict=True):
             indices = np.flatnonzero(selected)
             row[:] = np.resize(indices, row.size) if indices.size else 0
+
+
+def levelled(scan: LidarScan, roll_rad: float, pitch_rad: float) -> LidarScan:
+    """The scan with horizontal distances instead of those along the tilted beams (roll right side down, pitch nose up).
+
+    For the policy only: the safety filter takes the tilt out by itself and must get the scan as measured. Bearings move by
+    less than half a degree for tilts up to 7 degrees and are left alone.
+    """
+    bearings = scan.angle_min_rad + scan.angle_increment_rad * np.arange(scan.ranges_m.size)
+    along, across = np.cos(bearings), np.sin(bearings)
+    up = along * math.sin(pitch_rad) + across * math.sin(roll_rad) * math.cos(pitch_rad)
+    shorter = np.sqrt(np.maximum(0.0, 1.0 - up * up)).astype(np.float32)
+    return replace(scan, ranges_m=scan.ranges_m * shorter)
 
 
 def fill_unknown(ranges_m: NDArray[np.float32], range_max_m: float) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 from scip_peer import BEAMS, Device
 
-from flight.lidar import LidarSource, ScipDriver, open_lidar
+from flight.lidar import LidarDriver, LidarSource, open_lidar
 from flight.lidar.clock import MAX_DRIFT, WRAP_MS, DeviceClock, DeviceClockError
 from safety.messages import LidarScan
 
@@ -36,7 +36,7 @@ def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> bool:
     return condition()
 
 
-def next_scan(driver: ScipDriver, timeout_s: float = 5.0) -> LidarScan:
+def next_scan(driver: LidarDriver, timeout_s: float = 5.0) -> LidarScan:
     scan = driver.wait_for_scan(timeout_s)
     assert scan is not None, driver.health()
     return scan
@@ -401,7 +401,7 @@ def test_the_gateways_emulator_is_read_to_the_millimetre_and_to_the_clock() -> N
 def test_a_restarted_gateway_is_found_again() -> None:
     server_module = pytest.importorskip("sim_gateway.scip", reason="needs the extra `sim`")
 
-    def feed(server: object, zero_s: float, driver: ScipDriver) -> bool:
+    def feed(server: object, zero_s: float, driver: LidarDriver) -> bool:
         server.publish(time.monotonic() - zero_s, gateway_scan(0))  # type: ignore[attr-defined]
         return driver.wait_for_scan(0.03) is not None
 
