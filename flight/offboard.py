@@ -67,6 +67,7 @@ class OffboardFlight:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.log = FlightLog(max_ticks=int(mission.timeouts.flight_s * LOOP_RATE_HZ) + 200)
+        self.log.reserve()
         self.keeper = RateKeeper(LOOP_RATE_HZ, clock)
         self.events: list[str] = []
         self.stall_times_s: list[float] = []
@@ -145,7 +146,7 @@ class OffboardFlight:
         if self._judge.pausing(record) and record.sent != STILL:
             record = replace(record, sent=STILL)
         self._sent_s = self._link.send_velocity(record.sent, self._frame)
-        self.log.append(record, self._sent_s)
+        self.log.append(record, self._sent_s, self.keeper.lateness_s)
         self.log.see(scan, state)
         self._status.publish(record, self.keeper.deadline_misses)
         if self.keeper.ticks % TICKS_PER_TIME_QUESTION == 0:
