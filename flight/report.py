@@ -61,7 +61,9 @@ def events_of(run: Run) -> list[Event]:
     time_s = run.ticks["time_s"]
     found = [event for rule in sorted({rule for rules in run.rules for rule in rules}) for event in _rule_events(run, rule)]
     braking = run.ticks["braking"] == 1.0
-    found += [Event(time_s[a], time_s[b], "bad", f"braking ({b - a + 1} ticks)") for a, b in _stretches(braking)]
+    found += [
+        Event(time_s[a], time_s[b], "bad", f"braking ({_ticks(int(braking[a : b + 1].sum()))})") for a, b in _stretches(braking)
+    ]
     resets = np.flatnonzero(run.ticks["hidden_reset"] == 1.0)
     found += [Event(time_s[i], time_s[i], "plain", "recurrent state starts from zero") for i in resets]
     found += _late_events(run)
@@ -77,14 +79,24 @@ def events_of(run: Run) -> list[Event]:
 def _rule_events(run: Run, rule: str) -> list[Event]:
     where = np.array([rule in rules for rules in run.rules], dtype=bool)
     time_s = run.ticks["time_s"]
-    return [Event(time_s[a], time_s[b], "limited", f"{rule} ({int(where[a : b + 1].sum())} ticks)") for a, b in _stretches(where)]
+    return [Event(time_s[a], time_s[b], "limited", f"{rule} ({_ticks(where[a : b + 1])})") for a, b in _stretches(where)]
 
 
 def _late_events(run: Run) -> list[Event]:
     if run.timing is None:
         return []
     late, time_s = run.timing["lateness_ms"], run.timing["time_s"]
-    return [Event(time_s[i], time_s[i], "plain", f"tick {late[i]:.1f} ms late") for i in np.flatnonzero(late > LATE_MS)]
+    found = []
+    for a, b in _stretches(late > LATE_MS):
+        stretch = late[a : b + 1]
+        text = f"{_ticks(stretch > LATE_MS)} late, up to {float(np.nanmax(stretch)):.1f} ms"
+        found.append(Event(time_s[a], time_s[b], "plain", text))
+    return found
+
+
+def _ticks(where: NDArray[np.bool_]) -> str:
+    count = int(where.sum())
+    return "1 tick" if count == 1 else f"{count} ticks"
 
 
 def _stretches(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -138,19 +150,23 @@ def _text(value: float, unit: str, digits: int) -> str:
     return f"{value:.{digits}f} {unit}".rstrip() if math.isfinite(value) else "\N{EN DASH}"
 
 
+def _short(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+
+
 def _pair(run: Run, unit: str, digits: int, *keys: str) -> str:
     p50, p99 = (_text(run.number(*keys, name), "", digits) for name in ("p50", "p99"))
     return f"{p50} / {p99} {unit}"
 
 
 def _map_section(run: Run) -> str:
-    known = "outlined: obstacles the simulator knows; " if run.boxes is not None else ""
-    seen = "dark: what the LiDAR saw" if run.scans is not None else "no scans were kept"
+    known = "Outlined: obstacles the simulator knows. " if run.boxes is not None else ""
+    seen = "Dark: what the LiDAR saw." if run.scans is not None else "No scans were kept."
     keys = [("path", "vehicle, coloured by speed"), ("touched", "command limited"), ("stop", "braking"), ("goal", "goal")]
     keys += [("fence", "fence")] if run.corner("fence_m", "min") else []
     keys += [("truth", "true path")] if run.truth is not None else []
     scale = _scale(SPEED_COLOURS, "0", f"{top_speed(run):.2f} m/s")
-    note = f"<p>Ring: start, dot: end. {escape((known + seen).capitalize())}. Scroll sideways on a small screen.</p>"
+    note = f"<p>Ring: start, dot: end. {known}{seen} Scroll sideways on a small screen.</p>"
     return _section("Map", _wide(draw_map(run)) + _keys(keys) + scale + note)
 
 
@@ -197,7 +213,7 @@ def _timing_section(run: Run) -> str:
         values = run.timing[column][np.isfinite(run.timing[column])]
         if values.size:
             p50, p99, worst = np.percentile(values, (50.0, 99.0, 100.0))
-            heading = f"{name}: p50 {p50:.3g}, p99 {p99:.3g}, max {worst:.3g} {unit}"
+            heading = f"{name}: p50 {_short(p50)}, p99 {_short(p99)}, max {_short(worst)} {unit}"
             charts.append((heading, draw_histogram(values, unit, f"Histogram: {name}")))
     note = "<p>Number of ticks, logarithmic. Lines: p50 and p99.</p>"
     return _section("Timing", note + _grid(charts)) if charts else _section("Timing", "<p>No tick was timed.</p>")

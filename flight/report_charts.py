@@ -23,6 +23,7 @@ _MAX_MARKS = 400
 _MAX_CELLS = 4_000_000
 _WATERFALL_COLUMNS = 1200
 _TICK_S = 0.05
+_SCAN_STANDS_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +163,7 @@ def _ends(axes: Axes, x: NDArray[np.float64], y: NDArray[np.float64]) -> str:
         return ""
     spots = (("start", known[0]), ("end", known[-1]))
     return "".join(
-        f'<circle class="{name}" cx="{float(axes.px(x[i])):.1f}" cy="{float(axes.py(y[i])):.1f}" r="6"/>' for name, i in spots
+        f'<circle class="{name}" cx="{float(axes.px(x[i])):.1f}" cy="{float(axes.py(y[i])):.1f}" r="5"/>' for name, i in spots
     )
 
 
@@ -213,6 +214,9 @@ def draw_waterfall(scans: Scans | None) -> str:
     place = np.clip(((time_s - start_s) / (end_s - start_s) * columns).astype(np.intp), 0, columns - 1)
     image = np.full((columns, scans.bearings_rad.size), UNKNOWN, dtype=np.uint8)
     np.minimum.at(image, place, scans.codes)
+    for here, after in pairwise(np.unique(place)):  # a scan stands until the next one, unless that is long in coming
+        if 1 < after - here <= max(1.0, _SCAN_STANDS_S / (end_s - start_s) * columns):
+            image[here + 1 : after] = image[here]
     half = 0.5 * abs(float(scans.bearings_rad[-1] - scans.bearings_rad[0])) / max(1, scans.bearings_rad.size - 1)
     bearings_deg = np.degrees([scans.bearings_rad[0] - half, scans.bearings_rad[-1] + half + 1e-9])
     width = WIDE - WIDE_LEFT - 12.0
