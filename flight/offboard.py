@@ -247,7 +247,7 @@ class FlightJudge:
 def _quiet_interpreter() -> Iterator[None]:
     """No garbage collection in the loop (a full one takes 10 to 100 ms), and quick hand-over between threads."""
     interval = sys.getswitchinterval()
-    sys.setswitchinterval(0.001)
+    sys.setswitchinterval(0.0001)
     gc.collect()
     gc.freeze()
     gc.disable()

@@ -61,9 +61,7 @@ def events_of(run: Run) -> list[Event]:
     time_s = run.ticks["time_s"]
     found = [event for rule in sorted({rule for rules in run.rules for rule in rules}) for event in _rule_events(run, rule)]
     braking = run.ticks["braking"] == 1.0
-    found += [
-        Event(time_s[a], time_s[b], "bad", f"braking ({_ticks(int(braking[a : b + 1].sum()))})") for a, b in _stretches(braking)
-    ]
+    found += [Event(time_s[a], time_s[b], "bad", f"braking ({_ticks(braking[a : b + 1])})") for a, b in _stretches(braking)]
     resets = np.flatnonzero(run.ticks["hidden_reset"] == 1.0)
     found += [Event(time_s[i], time_s[i], "plain", "recurrent state starts from zero") for i in resets]
     found += _late_events(run)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flight.run_folder import Run
 from flight.scan_log import HIT_CELL_M, NOTHING, STEPS, UNKNOWN, Scans
-from flight.svg import Axes, limits, path_data, png_image, ramp, svg
+from flight.svg import Axes, limits, png_image, ramp, svg
 
 WIDE, WIDE_LEFT = 1120.0, 62.0
 CHART, CHART_HEIGHT = 560.0, 200.0
@@ -130,11 +130,15 @@ def _touched(axes: Axes, run: Run, band: Band) -> str:
     """Where the safety layer spoke: a broad band under the path, and a cross for braking."""
     x, y = axes.px(run.ticks["x_m"]), axes.py(run.ticks["y_m"])
     known = np.isfinite(x) & np.isfinite(y)
-    wide = path_data(np.where(band.limited, x, np.nan), y, axes.left, axes.width)
-    where = np.flatnonzero(band.braking & known)
-    marks = where[:: max(1, math.ceil(where.size / _MAX_MARKS))]
-    crosses = "".join(f"M{x[i] - 4:.1f} {y[i] - 4:.1f}l8 8m-8 0l8-8" for i in marks)
-    return f'<path class="touched" d="{wide}"/><path class="stop" d="{crosses}"/>'
+    broad = "".join(f"M{x[i]:.1f} {y[i]:.1f}h.1" for i in _some(band.limited & known, _MAX_PATH_POINTS))
+    crosses = "".join(f"M{x[i] - 4:.1f} {y[i] - 4:.1f}l8 8m-8 0l8-8" for i in _some(band.braking & known, _MAX_MARKS))
+    return f'<path class="touched" d="{broad}"/><path class="stop" d="{crosses}"/>'
+
+
+def _some(where: NDArray[np.bool_], most: int) -> NDArray[np.intp]:
+    """Indices of True, evenly thinned to at most `most`."""
+    indices = np.flatnonzero(where)
+    return indices[:: max(1, math.ceil(indices.size / most))]
 
 
 def _polyline(x: NDArray[np.float64], y: NDArray[np.float64]) -> str:
@@ -145,8 +149,7 @@ def _polyline(x: NDArray[np.float64], y: NDArray[np.float64]) -> str:
 def _path(axes: Axes, run: Run) -> str:
     """Stretches of one colour each: neighbouring ticks of about the same speed are one line."""
     speed = np.hypot(run.ticks["vx_m_s"], run.ticks["vy_m_s"])
-    known = np.flatnonzero(np.isfinite(run.ticks["x_m"] + run.ticks["y_m"] + speed))
-    known = known[:: max(1, math.ceil(known.size / _MAX_PATH_POINTS))]
+    known = _some(np.isfinite(run.ticks["x_m"] + run.ticks["y_m"] + speed), _MAX_PATH_POINTS)
     if known.size < 2:
         return ""
     x, y = axes.px(run.ticks["x_m"][known]), axes.py(run.ticks["y_m"][known])

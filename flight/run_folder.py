@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import math
+from array import array
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -65,22 +67,29 @@ def read_run(folder: Path) -> Run:
     summary = _read_json(folder / "summary.json")
     if not summary:
         raise ReportError(f"{folder} has no readable summary.json: give a folder that fly has written")
-    rows = _read_csv(folder / "trajectory.csv", CSV_COLUMNS)
-    if rows is None:
+    ticks = _read_csv(folder / "trajectory.csv", CSV_COLUMNS)
+    if ticks is None:
         raise ReportError(f"{folder / 'trajectory.csv'} is missing or not a file of fly's: give a folder that fly has written")
     timing = _read_csv(folder / "timing.csv", TIMING_COLUMNS)
     truth_report = _read_json(folder / "gateway.json")
-    at = CSV_COLUMNS.index("rules")
     boxes = _table(truth_report.get("boxes"))
     return Run(
         summary=summary,
-        ticks=_columns(rows, CSV_COLUMNS),
-        rules=[tuple(row[at].split()) for row in rows],
-        timing=_columns(timing, TIMING_COLUMNS) if timing else None,
+        ticks=ticks.columns,
+        rules=ticks.rules,
+        timing=timing.columns if timing is not None and timing.rules else None,
         scans=read_scans(folder / "scans.npz"),
         boxes=boxes[:MAX_BOXES] if boxes is not None and boxes.ndim == 2 and boxes.shape[1] == 6 else None,
         truth=truth_from_report(truth_report),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Sheet:
+    """A CSV file: its columns of numbers, and the words of its column `rules`, row by row."""
+
+    columns: dict[str, Column]
+    rules: list[tuple[str, ...]]
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -93,30 +102,31 @@ def _read_json(path: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _read_csv(path: Path, columns: tuple[str, ...]) -> list[list[str]] | None:
-    """The whole rows of a file with this header; None where it is another file. A torn last row is left out."""
-    rows: list[list[str]] = []
+def _read_csv(path: Path, names: tuple[str, ...]) -> _Sheet | None:
+    """The whole rows of a file with this header; None where it is another file. A torn last row is left out.
+
+    Row by row into columns: as text, an hour of ticks would take some 200 MB.
+    """
+    columns = {name: array("d") for name in names}
+    rules: list[tuple[str, ...]] = []
+    words: dict[str, tuple[str, ...]] = {}
     try:
         with path.open(encoding="ascii", newline="") as file:
             reader = csv.reader(file)
-            if tuple(next(reader, ())) != columns:
+            if tuple(next(reader, ())) != names:
                 return None
-            for row in reader:
-                if len(row) == len(columns):
-                    rows.append(row)
-                if len(rows) >= MAX_CSV_ROWS:
-                    break
+            for row in islice(reader, MAX_CSV_ROWS):
+                if len(row) != len(names):
+                    continue
+                cells = dict(zip(names, row, strict=True))
+                text = cells.pop("rules", "")
+                rules.append(words.setdefault(text, tuple(text.split())))
+                for name, cell in cells.items():
+                    columns[name].append(_cell(cell))
     except (OSError, ValueError, csv.Error):
         return None
-    return rows
-
-
-def _columns(rows: list[list[str]], names: tuple[str, ...]) -> dict[str, Column]:
-    return {
-        name: np.array([_cell(row[index]) for row in rows], dtype=np.float64)
-        for index, name in enumerate(names)
-        if name != "rules"
-    }
+    columns.pop("rules", None)
+    return _Sheet({name: np.array(values, dtype=np.float64) for name, values in columns.items()}, rules)
 
 
 def _cell(text: str) -> float:

@@ -59,12 +59,17 @@ class Axes:
     def bands(self, x: Floats, where: NDArray[np.bool_], step: float, style: str) -> str:
         """Shaded stretches of the x axis where `where` holds; `step` is how far one sample reaches."""
         right = self.left + self.width
-        parts = []
+        spans: list[tuple[float, float]] = []
         for first, last in runs(where):
             start = min(float(self.px(x[first])), right - 1.0)
-            stop = min(float(self.px(x[last] + step)), right)
-            parts.append(f"M{start:.1f} {self.top:g}H{max(stop, start + 1.0):.1f}V{self.top + self.height:g}H{start:.1f}z")
-        return f'<path class="{style}" d="{"".join(parts)}"/>' if parts else ""
+            stop = max(start + 1.0, min(float(self.px(x[last] + step)), right))
+            if spans and start - spans[-1][1] < 0.5:  # nearer than a screen can show: one band, and a small file
+                spans[-1] = (spans[-1][0], max(stop, spans[-1][1]))
+            else:
+                spans.append((start, stop))
+        bottom = self.top + self.height
+        shape = "".join(f"M{start:.1f} {self.top:g}H{stop:.1f}V{bottom:g}H{start:.1f}z" for start, stop in spans)
+        return f'<path class="{style}" d="{shape}"/>' if spans else ""
 
 
 def svg(width: float, height: float, content: str, description: str) -> str:
