@@ -110,12 +110,12 @@ def _hardware_priority(flight: int) -> None:
 
 
 def _mission(folder: Path) -> Path:
-    """The shipped mission with a goal too small to arrive at: it flies until its time is up."""
+    """The shipped mission at a speed too slow to arrive: it flies until its time is up, with the safety filter at work."""
     text = (ROOT / "configs" / "corridor.yaml").read_text(encoding="utf-8")
     replaced = {
         "../policies/": f"{ROOT}/policies/",
         "worlds/": f"{ROOT}/configs/worlds/",
-        "radius_m: 0.2": "radius_m: 0.05",
+        "\nsafety:\n": "\nsafety:\n  max_horizontal_speed_m_s: 0.4\n",
         "port: 10940": f"port: {_free_port(socket.SOCK_STREAM)}",
         "flight_s: 180.0": f"flight_s: {FLIGHT_S}\n  stuck_s: 3600.0",
         "\nsim:\n": f"\nsim:\n  onboard_port: {_free_port(socket.SOCK_DGRAM)}\n  gcs_port: {_free_port(socket.SOCK_DGRAM)}\n",
