@@ -40,6 +40,8 @@ MAX_STALLS = 3
 STALL_WINDOW_S = 5.0
 LOSS_CERTAINTY = 0.8
 TICKS_PER_TIME_QUESTION = 4
+SWITCH_INTERVAL_S = 1e-4
+"""The longest that a telemetry callback may keep the waking loop from the interpreter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +249,7 @@ class FlightJudge:
 def _quiet_interpreter() -> Iterator[None]:
     """No garbage collection in the loop (a full one takes 10 to 100 ms), and quick hand-over between threads."""
     interval = sys.getswitchinterval()
-    sys.setswitchinterval(0.0001)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()
     gc.disable()
