@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 from flight.errors import MissionError
 from flight.lidar.config import LidarSource
 from flight.px4 import LossAction
+from flight.realtime import RealTimeConfig
 from safety.config import SafetyConfig
 from safety.escalation import EscalationConfig
 from safety.frames import CorridorVector
@@ -139,6 +140,7 @@ class Mission(_Section):
     lidar: LidarSource = LidarSource()
     timeouts: TimeoutSection = TimeoutSection()
     failsafe: FailsafeSection = FailsafeSection()
+    realtime: RealTimeConfig = RealTimeConfig()
     sim: SimSection | None = Field(default=None, validate_default=True)
 
     @property

@@ -40,6 +40,8 @@ MAX_STALLS = 3
 STALL_WINDOW_S = 5.0
 LOSS_CERTAINTY = 0.8
 TICKS_PER_TIME_QUESTION = 4
+SWITCH_INTERVAL_S = 1e-4
+"""The longest that a telemetry callback may keep the waking loop from the interpreter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +69,7 @@ class OffboardFlight:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.log = FlightLog(max_ticks=int(mission.timeouts.flight_s * LOOP_RATE_HZ) + 200)
+        self.log.reserve()
         self.keeper = RateKeeper(LOOP_RATE_HZ, clock)
         self.events: list[str] = []
         self.stall_times_s: list[float] = []
@@ -148,7 +151,7 @@ class OffboardFlight:
         if self._clock() - self._sent_s > self._loss_certain_s:  # held up since the tick began
             return self._after_stall(self._clock())
         self._sent_s = self._link.send_velocity(record.sent, self._frame)
-        self.log.append(record, self._sent_s)
+        self.log.append(record, self._sent_s, self.keeper.lateness_s)
         self.log.see(scan, state)
         self._status.publish(record, self.keeper.deadline_misses)
         if self.keeper.ticks % TICKS_PER_TIME_QUESTION == 0:
@@ -246,7 +249,7 @@ class FlightJudge:
 def _quiet_interpreter() -> Iterator[None]:
     """No garbage collection in the loop (a full one takes 10 to 100 ms), and quick hand-over between threads."""
     interval = sys.getswitchinterval()
-    sys.setswitchinterval(0.001)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()
     gc.disable()

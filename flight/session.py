@@ -37,11 +37,14 @@ from flight.preflight import (
     require,
 )
 from flight.px4 import FlightMode, mode_name
+from flight.realtime import real_time
+from flight.report import write_report
 from flight.results import judge_flight, true_distance_m, truth_from_report
+from flight.scan_log import write_scans
 from flight.status import Status
 from flight.summary import build_summary, write_json_atomic
 from flight.tick import Pilot
-from flight.trajectory import draw_trajectory_png, write_trajectory_csv
+from flight.trajectory import draw_trajectory_png, write_timing_csv, write_trajectory_csv
 from policy_export.errors import PolicyError
 from policy_export.runner import PolicyRunner
 from safety.filter import SafetyFilter
@@ -103,7 +106,8 @@ class FlightSession:
             level = self._mission.lidar.tilt_compensation
             pilot = Pilot(policy, SafetyFilter(self._mission.safety), place.goal, self._mission.goal.radius_m, level_scans=level)
             flight = OffboardFlight(link, lidar, pilot, frame, self._mission, self._interrupt, self._status)
-            ending, landed = self._fly(link, flight, frame)
+            with real_time(self._mission.realtime, self._status.phase):
+                ending, landed = self._fly(link, flight, frame)
             link.close()
             stack.close()  # the gateway writes its report when it ends
         return self._results(flight, policy, place, ending, landed)
@@ -341,12 +345,18 @@ class FlightSession:
                 "mission": self._mission.name,
                 "seed": self._mission.sim.seed if self._mission.sim else None,
                 "goal_m": [place.goal.x, place.goal.y, place.goal.z],
+                "goal_radius_m": self._mission.goal.radius_m,
+                "fence_m": {"min": self._mission.safety.fence.min_m, "max": self._mission.safety.fence.max_m},
                 "true_distance_to_goal_m": true_distance_m(report, place.goal),
             },
         )
         write_json_atomic(self._folder / "summary.json", summary)
         write_trajectory_csv(self._folder / "trajectory.csv", flight.log)
+        write_timing_csv(self._folder / "timing.csv", flight.log)
+        start_s = flight.log.records[0].now_s if flight.log.records else 0.0
+        write_scans(self._folder / "scans.npz", flight.log.scans.scans(), start_s)
         self._draw(flight, place, report, f"{self._mission.name}: {outcome}")
+        write_report(self._folder)
         return FlightResult(exit_code, outcome, message, self._folder, summary)
 
     def _draw(self, flight: OffboardFlight, place: Place, report: dict[str, Any], title: str) -> None:

@@ -69,7 +69,11 @@ def build_summary(
 
 def write_json_atomic(path: Path, document: Mapping[str, object]) -> None:
     """Write JSON so that a reader or a power cut finds the old file or the whole new one. NaN and infinity become null."""
-    text = json.dumps(_plain(document), indent=2, allow_nan=False) + "\n"
+    write_text_atomic(path, json.dumps(_plain(document), indent=2, allow_nan=False) + "\n")
+
+
+def write_text_atomic(path: Path, text: str) -> None:
+    """Write UTF-8 text so that a reader or a power cut finds the old file or the whole new one."""
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:

@@ -1,11 +1,10 @@
-"""The flight as flown: a bounded log of ticks, a CSV that is the same for the same flight, and the picture from above."""
+"""The flight as flown: a CSV that is the same for the same flight, one of its timing, and the picture from above."""
 
 from __future__ import annotations
 
 import csv
 import logging
 import math
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,10 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from flight.flight_log import FlightLog as FlightLog  # noqa: PLC0414  (named here since the first flights)
+from flight.scan_log import MAX_HIT_CELLS as MAX_HIT_CELLS  # noqa: PLC0414
 from flight.tick import TickRecord
 from safety.config import Fence
 from safety.frames import CorridorVector
-from safety.messages import LidarScan, VehicleState
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,10 +24,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-HIT_CELL_M = 0.05
-MAX_HIT_CELLS = 100_000
-_HIT_EVERY_S = 0.2
-
+TIMING_COLUMNS = ("time_s", "lateness_ms", "scan_to_setpoint_ms", "inference_us")
 CSV_COLUMNS = (
     "time_s",
     "x_m",
@@ -56,64 +53,6 @@ CSV_COLUMNS = (
 )
 
 
-class FlightLog:
-    """Ticks of one flight, oldest first. `max_ticks` bounds it (duration limit times rate); later ticks are only counted."""
-
-    def __init__(self, max_ticks: int = 72_000) -> None:
-        if max_ticks < 1:
-            raise ValueError(f"max_ticks must be at least 1, not {max_ticks}")
-        self._max_ticks = max_ticks
-        self.records: list[TickRecord] = []
-        self.sent_times_s: list[float] = []
-        self.dropped = 0
-        self._hits: dict[tuple[int, int], None] = {}
-        self._hits_taken_s = -math.inf
-
-    def append(self, record: TickRecord, sent_time_s: float) -> None:
-        """`sent_time_s`: when the setpoint had been handed to the link, on the clock of `record.now_s`."""
-        if len(self.records) >= self._max_ticks:
-            self.dropped += 1
-            return
-        self.records.append(record)
-        self.sent_times_s.append(sent_time_s)
-
-    def see(self, scan: LidarScan | None, state: VehicleState | None) -> None:
-        """Keep where the LiDAR saw something (a few times a second), for the picture of a flight without known obstacles."""
-        if scan is None or state is None or len(self._hits) >= MAX_HIT_CELLS:
-            return
-        if scan.time_s - self._hits_taken_s < _HIT_EVERY_S:
-            return
-        self._hits_taken_s = scan.time_s
-        points = _hit_points(scan, state)
-        cells = np.unique(np.floor(points / HIT_CELL_M).astype(np.int64), axis=0)
-        self._hits.update(((int(x), int(y)), None) for x, y in cells)
-
-    @property
-    def hit_points_m(self) -> NDArray[np.float64]:
-        """[n, 2] corridor x, y of the cells in which `see` saw something."""
-        return (np.array(list(self._hits), dtype=np.float64).reshape(-1, 2) + 0.5) * HIT_CELL_M
-
-    def __len__(self) -> int:
-        return len(self.records)
-
-    def __iter__(self) -> Iterator[tuple[TickRecord, float]]:
-        return zip(self.records, self.sent_times_s, strict=True)
-
-    @property
-    def positions_m(self) -> NDArray[np.float64]:
-        """[n, 3] corridor positions of the ticks that had a state."""
-        points = [(r.position.x, r.position.y, r.position.z) for r in self.records if r.position is not None]
-        return np.array(points, dtype=np.float64).reshape(-1, 3)
-
-
-def _hit_points(scan: LidarScan, state: VehicleState) -> NDArray[np.float64]:
-    """[n, 2] corridor x, y of the returns, taking the scan plane as horizontal."""
-    hit = np.isfinite(scan.ranges_m) & (scan.ranges_m >= scan.range_min_m)
-    ranges = scan.ranges_m[hit].astype(np.float64)
-    angles = state.yaw_rad + scan.angle_min_rad + scan.angle_increment_rad * np.flatnonzero(hit)
-    return np.column_stack((state.position.x + ranges * np.cos(angles), state.position.y + ranges * np.sin(angles)))
-
-
 def write_trajectory_csv(path: Path, log: FlightLog) -> None:
     """One row a tick, `CSV_COLUMNS`, six decimals, NaN as an empty cell, times from the first tick.
 
@@ -125,6 +64,17 @@ def write_trajectory_csv(path: Path, log: FlightLog) -> None:
         start_s = log.records[0].now_s if log.records else 0.0
         for record in log.records:
             writer.writerow(_row(record, start_s))
+
+
+def write_timing_csv(path: Path, log: FlightLog) -> None:
+    """One row a tick, `TIMING_COLUMNS`: what this computer's clock said, and so never the same twice."""
+    with path.open("w", encoding="ascii", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(TIMING_COLUMNS)
+        start_s = log.records[0].now_s if log.records else 0.0
+        for (record, sent_s), lateness_s in zip(log, log.lateness_s.tolist(), strict=True):
+            times = (1e3 * lateness_s, 1e3 * (sent_s - record.scan_time_s), 1e6 * record.inference_s)
+            writer.writerow([_cell(record.now_s - start_s), *map(_cell, times)])
 
 
 def _row(record: TickRecord, start_s: float) -> list[str]:

@@ -126,6 +126,8 @@ def test_writes_the_run_folder(flown: Flown) -> None:
     stand, _, _ = result(flown, to_the_goal)
     folder = stand.folder / "run"
     assert (folder / "trajectory.png").read_bytes().startswith(b"\x89PNG")
+    report = (folder / "report.html").read_text(encoding="utf-8")
+    assert all(title in report for title in ("Map of the flight", "LiDAR ranges over time", "Histogram: From scan to setpoint"))
     with (folder / "trajectory.csv").open() as file:
         rows = list(csv.DictReader(file))
     stalled = len([event for event in stand.summary()["failsafe_events"] if "stalled" in event])
