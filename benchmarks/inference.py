@@ -65,7 +65,7 @@ def run(json: bool) -> list[dict[str, Any]]:
     """Medians and 99th percentiles per step, microseconds; ratios within this run."""
     import torch
 
-    from policy_export.graph import DEFAULT_MEMORY_FORM
+    from policy_export.graph_writer import DEFAULT_MEMORY_FORM
 
     torch.set_num_threads(1)
     network, files = _files()

@@ -89,6 +89,7 @@ def report(campaign: Campaign, split_name: str, results: list[EpisodeResult]) ->
     return {
         "policy": str(campaign.policy),
         "policy_sha256": runner.sha256,
+        "weights_sha256": runner.metadata.weights_sha256,
         "split": split_name,
         "description": campaign.split.description,
         "first_seed": campaign.split.first_seed,

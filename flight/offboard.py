@@ -74,6 +74,7 @@ class OffboardFlight:
         self._mission, self._interrupt, self._status, self._clock = mission, interrupt, status, clock
         self._sent_s = -math.inf
         self._engaged = False
+        self._mode_changes = 0
         self._loss_certain_s = LOSS_CERTAINTY * mission.failsafe.setpoint_loss_timeout_s
         self._reboots = link.telemetry.clock.reboots
         self._judge = FlightJudge(mission)
@@ -87,7 +88,7 @@ class OffboardFlight:
             time.sleep(0.01)
         self._pilot.reset()
         self._link.set_mode(FlightMode.OFFBOARD, keep_alive=self.stay)
-
+        self._mode_changes = self._link.telemetry.mode_change_count
         self._engaged = True
 
     def stay(self) -> None:
@@ -144,6 +145,8 @@ class OffboardFlight:
         record = self._pilot.tick(scan, state, now_s)
         if self._judge.pausing(record) and record.sent != STILL:
             record = replace(record, sent=STILL)
+        if self._clock() - self._sent_s > self._loss_certain_s:  # held up since the tick began
+            return self._after_stall(self._clock())
         self._sent_s = self._link.send_velocity(record.sent, self._frame)
         self.log.append(record, self._sent_s)
         self.log.see(scan, state)
@@ -179,8 +182,9 @@ class OffboardFlight:
             return Ending("vehicle_rebooted", ExitCode.NOT_REACHED, "the autopilot restarted in flight: control given up", False)
         if telemetry.armed is False:
             return Ending("disarmed", ExitCode.NOT_REACHED, "the vehicle was disarmed in flight: control given up", False)
-        if telemetry.mode != FlightMode.OFFBOARD:
-            name = mode_name(telemetry.mode)
+        changed = telemetry.mode_change_count != self._mode_changes  # also when it is OFFBOARD again by now
+        if changed or telemetry.mode != FlightMode.OFFBOARD:
+            name = mode_name(next((mode for _, mode in reversed(telemetry.mode_changes) if mode != FlightMode.OFFBOARD), None))
             return Ending(
                 "pilot_took_over", ExitCode.NOT_REACHED, f"mode {name} was not commanded by fly: control given up", False
             )

@@ -142,6 +142,7 @@ class Telemetry:
         self.armed: bool | None = None
         self.mode: int | None = None
         self.mode_changes: deque[tuple[float, int]] = deque(maxlen=200)
+        self.mode_change_count = 0
         self.landed_state: int | None = None
         self.battery_fraction: float | None = None
         self.texts: deque[StatusText] = deque(maxlen=MAX_TEXTS)
@@ -223,6 +224,7 @@ class Telemetry:
         mode = mode_of(custom_mode)
         if mode != self.mode:
             self.mode_changes.append((arrival_s, mode))
+            self.mode_change_count += 1
         self.mode = mode
 
     def _on_landed(self, fields: dict[str, object], _arrival_s: float) -> None:

@@ -62,7 +62,10 @@ def bare_step(model: bytes, file: PolicyFile) -> Callable[[], object]:
     inputs = observations(file)
     buffer = np.zeros((1, inputs.shape[1]), dtype=np.float32)
     shapes_in, shapes_out = expected_ports(file.metadata)
-    shapes = {name: tuple(size or 1 for size in shape) for name, shape in (shapes_in | shapes_out | {"value": (1,)}).items()}
+    shapes = {
+        name: tuple(1 if size is None else size for size in shape)
+        for name, shape in (shapes_in | shapes_out | {"value": (1,)}).items()
+    }
     kept: list[Any] = [buffer]
     pairs = {"h": (_zeros(shapes, "h_in"), _zeros(shapes, "h_in")), "c": (_zeros(shapes, "c_in"), _zeros(shapes, "c_in"))}
     bindings = []

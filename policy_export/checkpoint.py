@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-import struct
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,29 +19,18 @@ from policy_export.contract import (
 )
 from policy_export.errors import CheckpointError
 from policy_export.network import NetworkConfig, PolicyNetwork
+from policy_export.sb3_network import Sb3Network
+from policy_export.weights import UNREADABLE
 
 MAX_CHECKPOINT_BYTES = 512 * 1024 * 1024
 _NEEDED = ("network_config", "state_dict", "training", "layout")
-# What torch's restricted unpickler raises on damaged files, seen by cutting and flipping bytes.
-_UNREADABLE = (
-    OSError,
-    RuntimeError,
-    ValueError,
-    EOFError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    AssertionError,
-    OverflowError,
-    MemoryError,
-    struct.error,
-    zipfile.BadZipFile,
-    pickle.UnpicklingError,
-)
 _MOTION_ORDERS = {
     ("lidar", "goal_offset", "velocity", "acceleration", "yaw"),
     ("lidar", "position", "velocity", "acceleration", "yaw"),
 }
+
+
+TrainedNetwork = PolicyNetwork | Sb3Network
 
 
 class PolicyLayout(BaseModel):
@@ -62,7 +48,7 @@ class PolicyLayout(BaseModel):
 class Checkpoint:
     """A network with everything that its file will say about it."""
 
-    network: PolicyNetwork
+    network: TrainedNetwork
     layout: PolicyLayout
     training: TrainingRecord
 
@@ -111,7 +97,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path}: larger than {MAX_CHECKPOINT_BYTES} bytes")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise CheckpointError(f"{path}: not a readable checkpoint ({type(error).__name__})") from None
     if not isinstance(content, dict):
         raise CheckpointError(f"{path}: not a checkpoint written by train-policy")

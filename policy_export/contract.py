@@ -22,12 +22,19 @@ DIGEST_KEY = "lstm_pilot_sha256"
 """Key of the digest over the whole file (docs/policy_file.md, "Digests")."""
 MAX_METADATA_BYTES = 256 * 1024
 
-ChannelName = Literal["lidar", "goal_offset", "position", "velocity", "acceleration", "yaw"]
-ChannelFrame = Literal["sensor", "heading", "corridor"]
-Unit = Literal["m", "m/s", "m/s^2", "rad"]
+ChannelName = Annotated[
+    str, Field(pattern=r"^(lidar|goal_offset|position|velocity|acceleration|yaw|other(_[a-z0-9]+)*)$", max_length=64)
+]
+ChannelFrame = Literal["sensor", "heading", "corridor", "none"]
+Unit = Annotated[str, Field(min_length=1, max_length=32)]
 ResetReason = Literal["offboard_entry", "goal_change", "policy_change", "gap"]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-Four = tuple[float, float, float, float]
+ActionName = Annotated[str, Field(pattern=r"^(vx|vy|vz|yaw_rate|other(_[a-z0-9]+)*)$", max_length=64)]
+Limits = Annotated[tuple[float, ...], Field(min_length=1, max_length=64)]
+
+VELOCITY_ACTION = ("vx", "vy", "vz", "yaw_rate")
+"""The action that a drone flies; every other is only carried."""
+MAX_LAYERS = 8
 
 _CHANNEL_UNITS: dict[str, str] = {
     "lidar": "m",
@@ -56,6 +63,7 @@ class ChannelSpec(_Model):
 
     `lidar`: ranges in beam order. `goal_offset`: goal minus own position. `position`: own position in the corridor frame.
     `velocity`, `acceleration` (gravity removed): of the vehicle. `yaw`: corridor yaw in [-pi, pi], counter-clockwise.
+    `other` and `other_...`: anything else, of any width, unit and frame; only programs made for that policy can build it.
     """
 
     name: ChannelName
@@ -66,11 +74,20 @@ class ChannelSpec(_Model):
 
     @model_validator(mode="after")
     def _meaningful(self) -> ChannelSpec:
+        if self.stop <= self.start:
+            raise ValueError(f"stop ({self.stop}) must be above start ({self.start})")
+        if self.is_other:
+            return self
         if self.unit != _CHANNEL_UNITS[self.name]:
             raise ValueError(f"unit of {self.name} must be {_CHANNEL_UNITS[self.name]}, not {self.unit}")
         if self.frame not in _CHANNEL_FRAMES[self.name]:
             raise ValueError(f"frame of {self.name} must be one of {', '.join(_CHANNEL_FRAMES[self.name])}, not {self.frame}")
         return self
+
+    @property
+    def is_other(self) -> bool:
+        """Whether its meaning is outside this contract."""
+        return is_other(self.name)
 
     @property
     def width(self) -> int:
@@ -103,18 +120,18 @@ class LidarSpec(_Model):
 
 
 class ObservationLayout(_Model):
-    """The whole observation: channels that cover `0:size` without gap or overlap."""
+    """The whole observation: channels that cover `0:size` without gap or overlap. Without a `lidar` channel, `lidar` is idle."""
 
     size: int = Field(gt=0, le=8192)
-    lidar: LidarSpec
-    channels: tuple[ChannelSpec, ...] = Field(min_length=1, max_length=16)
+    lidar: LidarSpec = LidarSpec()
+    channels: tuple[ChannelSpec, ...] = Field(min_length=1, max_length=64)
 
     @model_validator(mode="after")
     def _covers(self) -> ObservationLayout:
         position = 0
         names: set[str] = set()
         for channel in self.channels:
-            expected = {"lidar": self.lidar.beams, "yaw": 1}.get(channel.name, 3)
+            expected = channel.width if channel.is_other else channel_width(channel.name, self.lidar)
             if channel.start != position:
                 raise ValueError(f"channel {channel.name} must start at {position}, not {channel.start}")
             if channel.width != expected:
@@ -135,19 +152,39 @@ class ObservationLayout(_Model):
 class ActionLayout(_Model):
     """vx, vy, vz in m/s and yaw rate in rad/s (counter-clockwise), within `low` and `high`.
 
-    `heading`: x ahead, y left, z up, turned by the yaw of the tick. `corridor`: x along the corridor, y left, z up.
+    `heading`: x ahead, y left, z up, turned by the yaw of the tick. `corridor`: x along the corridor, y left, z up. An axis
+    that the policy leaves alone has both limits 0. `none`: not a velocity command at all, `names` are `other...`; such a file
+    is exported and checked like any other, but no vehicle of this project flies it.
     """
 
-    frame: Literal["heading", "corridor"] = "heading"
-    low: Four = (-0.5, -0.5, -0.5, -1.0)
-    high: Four = (1.0, 0.5, 0.5, 1.0)
+    frame: Literal["heading", "corridor", "none"] = "heading"
+    names: Annotated[tuple[ActionName, ...], Field(min_length=1, max_length=64)] = VELOCITY_ACTION
+    low: Limits = (-0.5, -0.5, -0.5, -1.0)
+    high: Limits = (1.0, 0.5, 0.5, 1.0)
 
     @model_validator(mode="after")
     def _ordered(self) -> ActionLayout:
-        for name, low, high in zip(("vx", "vy", "vz", "yaw_rate"), self.low, self.high, strict=True):
-            if not -50.0 <= low < high <= 50.0:
-                raise ValueError(f"limits of {name} must satisfy -50 <= low < high <= 50, not {low} .. {high}")
+        bound = 50.0 if self.is_velocity else 1e6
+        if not self.is_velocity and (self.frame != "none" or not all(is_other(name) for name in self.names)):
+            raise ValueError(f"names must be {', '.join(VELOCITY_ACTION)}; in frame none they must all be other...")
+        if self.is_velocity and self.frame == "none":
+            raise ValueError("frame must be heading or corridor for a velocity command")
+        if len(set(self.names)) != len(self.names) or not len(self.names) == len(self.low) == len(self.high):
+            raise ValueError(f"names, low and high must be of one length ({len(self.names)}) and no name may repeat")
+        for name, low, high in zip(self.names, self.low, self.high, strict=True):
+            if not (-bound <= low < high <= bound or low == high == 0.0):
+                raise ValueError(f"limits of {name} must satisfy -{bound:g} <= low < high <= {bound:g}, not {low} .. {high}")
         return self
+
+    @property
+    def is_velocity(self) -> bool:
+        """Whether it is the command of four values that a vehicle flies."""
+        return self.names == VELOCITY_ACTION
+
+    @property
+    def size(self) -> int:
+        """Number of values."""
+        return len(self.names)
 
 
 class ResetRules(_Model):
@@ -170,7 +207,9 @@ class TrainingRecord(_Model):
 class VerificationRecord(_Model):
     """How closely the file's graph follows the trained network, measured before the file was written.
 
-    `max_action_difference`: m/s or rad/s. `max_abs_difference`: over action, h, c and value (docs/policy_file.md says how).
+    `max_action_difference`: m/s or rad/s, each side carrying its own state. `max_abs_difference`: the largest over that and over
+    h, c and value one step after a common state. `max_state_drift`: how far h, c and value came apart when each side carried its
+    own (docs/policy_file.md says how each is measured); null in files that were written before it was kept.
     """
 
     steps: int = Field(gt=0)
@@ -182,6 +221,7 @@ class VerificationRecord(_Model):
     tolerance: float = Field(gt=0.0)
     max_action_difference: float = Field(ge=0.0)
     max_abs_difference: float = Field(ge=0.0)
+    max_state_drift: float | None = Field(default=None, ge=0.0)
 
     @model_validator(mode="after")
     def _passed(self) -> VerificationRecord:
@@ -194,6 +234,7 @@ class PolicyMetadata(_Model):
     """Everything a program needs to fly the file. Kept as JSON in the ONNX file under `METADATA_KEY`.
 
     `memory` names the recurrent cell; `hidden_size` is 0 exactly when it is `none`, and then the graph has no state inputs.
+    `layers`: stacked cells of `hidden_size` each; h and c are [layers, batch, hidden_size].
     """
 
     schema_version: Literal[1] = 1
@@ -203,7 +244,7 @@ class PolicyMetadata(_Model):
     rate_hz: float = Field(default=20.0, gt=0.0, le=1000.0)
     memory: Literal["lstm", "none"]
     hidden_size: int = Field(ge=0, le=4096)
-    layers: Literal[1] = 1
+    layers: int = Field(default=1, ge=1, le=MAX_LAYERS)
     reset: ResetRules = ResetRules()
     training: TrainingRecord = TrainingRecord()
     evaluation: dict[str, JsonValue] = Field(default_factory=dict)
@@ -214,6 +255,8 @@ class PolicyMetadata(_Model):
     def _state(self) -> PolicyMetadata:
         if (self.memory == "none") != (self.hidden_size == 0):
             raise ValueError("hidden_size must be 0 exactly when memory is none")
+        if self.memory == "none" and self.layers != 1:
+            raise ValueError("layers must be 1 when memory is none")
         return self
 
     def to_json(self) -> str:
@@ -222,6 +265,32 @@ class PolicyMetadata(_Model):
         if len(text.encode()) > MAX_METADATA_BYTES:
             raise PolicyFileError("metadata", f"larger than {MAX_METADATA_BYTES} bytes; shorten training details or evaluation")
         return text
+
+
+def is_other(name: str) -> bool:
+    """Whether a channel's or action's name says that its meaning is outside this contract."""
+    return name == "other" or name.startswith("other_")
+
+
+def channel_width(name: str, lidar: LidarSpec) -> int:
+    """Number of values of a channel that this contract knows."""
+    return {"lidar": lidar.beams, "yaw": 1}.get(name, 3)
+
+
+def channel_unit(name: str) -> str | None:
+    """The unit of a channel that this contract knows; None for the others."""
+    return _CHANNEL_UNITS.get(name)
+
+
+def channel_frames(name: str) -> tuple[str, ...]:
+    """The frames that a channel may be given in, the usual one first; empty for channels that this contract does not know."""
+    return _CHANNEL_FRAMES.get(name, ())
+
+
+def foreign_fields(metadata: PolicyMetadata) -> list[str]:
+    """Fields that only a program made for this policy can honour: observation channels or actions called `other...`."""
+    fields = [f"observation.channels.{k}.name {c.name}" for k, c in enumerate(metadata.observation.channels) if c.is_other]
+    return fields if metadata.action.is_velocity else [*fields, f"action.names {', '.join(metadata.action.names)}"]
 
 
 def default_layout(lidar: LidarSpec | None = None, frame: Literal["heading", "corridor"] = "heading") -> ObservationLayout:

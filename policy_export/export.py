@@ -10,12 +10,18 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from policy_export.checkpoint import Checkpoint, load_checkpoint
+from policy_export.checkpoint import Checkpoint, TrainedNetwork, load_checkpoint
 from policy_export.contract import DIGEST_KEY, METADATA_KEY, PolicyMetadata, VerificationRecord, first_problem
-from policy_export.errors import PolicyError, PolicyFileError, VerificationError
-from policy_export.graph import DEFAULT_MEMORY_FORM, MemoryForm, build_model
+from policy_export.errors import CheckpointError, PolicyError, PolicyFileError, VerificationError
+from policy_export.graph import build_model
+from policy_export.graph_writer import DEFAULT_MEMORY_FORM, MemoryForm
+from policy_export.layout_file import layout_of_file, read_layout
 from policy_export.onnx_reader import file_sha256, read_model, weights_sha256
 from policy_export.policy_file import check_policy_bytes
+from policy_export.sb3 import Sb3Options, load_sb3
+from policy_export.sb3_archive import is_sb3_archive
+from policy_export.sb3_graph import build_sb3_model
+from policy_export.sb3_network import Sb3Network
 from policy_export.verify import verify_file, verify_model
 
 MAX_EVALUATION_BYTES = 128 * 1024
@@ -28,11 +34,35 @@ def export_checkpoint(
     name: str | None = None,
     evaluation: dict[str, Any] | None = None,
     memory_form: MemoryForm = DEFAULT_MEMORY_FORM,
+    layout: str | Path | None = None,
+    options: Sb3Options | None = None,
 ) -> PolicyMetadata:
-    """Export a checkpoint; returns the metadata written. See `export_policy` for the errors."""
-    checkpoint = load_checkpoint(checkpoint_path)
+    """Export a checkpoint; returns the metadata written. See `load_any` and `export_policy` for the errors."""
+    checkpoint = load_any(checkpoint_path, layout, options)
     name = name or Path(output_path).stem
     return export_policy(checkpoint, output_path, name=name, evaluation=evaluation, memory_form=memory_form)
+
+
+def load_any(path: str | Path, layout: str | Path | None = None, options: Sb3Options | None = None) -> Checkpoint:
+    """A checkpoint of this project, or an SB3 `.zip`; which it is, its content says.
+
+    `layout`: a YAML file or built-in name for `read_layout`; `options`: see `Sb3Options`. Both are only for SB3, whose archives
+    do not say what their observations mean. Raises `CheckpointError` or `strict_yaml.ConfigError`.
+    """
+    if is_sb3_archive(path):
+        return load_sb3(path, read_layout(layout), options)
+    if layout is not None or options not in {None, Sb3Options()}:
+        problem = "is no SB3 archive; this project's checkpoints carry their own layout, limits and normalisation"
+        raise CheckpointError(f"{path}: {problem}, leave out --layout and the options for SB3")
+    return load_checkpoint(path)
+
+
+def load_for_file(path: str | Path, metadata: PolicyMetadata, options: Sb3Options | None = None) -> Checkpoint:
+    """The checkpoint that a finished file is compared with; an SB3 archive takes its layout from the file."""
+    if not is_sb3_archive(path):
+        return load_any(path, None, options)
+    layout = layout_of_file(metadata.observation, metadata.action, metadata.rate_hz, metadata.reset)
+    return load_sb3(path, layout, options)
 
 
 def export_policy(
@@ -52,7 +82,7 @@ def export_policy(
     output = Path(output_path)
     if not output.parent.is_dir():
         raise PolicyError(f"{output.parent}: no such folder; create it first")
-    model = build_model(checkpoint.network, memory_form)
+    model = _graph_of(checkpoint.network, memory_form)
     graph = model.SerializeToString()
     try:
         verification = verify_model(graph, checkpoint.network, checkpoint.layout.observation)
@@ -64,6 +94,10 @@ def export_policy(
     check_policy_bytes(data, output)
     _write_verified(data, output, checkpoint)
     return metadata
+
+
+def _graph_of(network: TrainedNetwork, memory_form: MemoryForm) -> Any:
+    return build_sb3_model(network, memory_form) if isinstance(network, Sb3Network) else build_model(network, memory_form)
 
 
 def finish_file(model: Any, metadata: PolicyMetadata) -> bytes:
@@ -104,6 +138,7 @@ def _metadata(
             rate_hz=layout.rate_hz,
             memory=config.memory,
             hidden_size=config.state_size,
+            layers=config.layers,
             reset=layout.reset,
             training=checkpoint.training,
             evaluation=evaluation,

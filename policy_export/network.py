@@ -70,6 +70,16 @@ class NetworkConfig(BaseModel):
         return self.hidden_size if self.memory == "lstm" else 0
 
     @property
+    def layers(self) -> int:
+        """Stacked LSTM layers; this network has one."""
+        return 1
+
+    @property
+    def action_size(self) -> int:
+        """Number of actions."""
+        return 4
+
+    @property
     def feature_size(self) -> int:
         """Width of `PolicyNetwork.features`."""
         if self.preprocessing == "channels":
@@ -124,6 +134,10 @@ class PolicyNetwork(nn.Module):
                     nn.init.orthogonal_(parameter)
                 else:
                     nn.init.zeros_(parameter)
+
+    def observation_spread(self) -> None:
+        """Mean and deviation of training's observations: unknown, the network scales them by fixed numbers."""
+        return
 
     def initial_state(self, batch: int) -> State:
         """Zero h and c [1, batch, H] in the network's own type and device."""

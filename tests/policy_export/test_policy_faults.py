@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 from policy_samples import Damage, damaged, seal
 
+from policy_export import runner
 from policy_export.contract import DIGEST_KEY, METADATA_KEY
 from policy_export.errors import PolicyFileError
 from policy_export.onnx_reader import read_model, weights_sha256
@@ -215,7 +216,9 @@ DAMAGES: list[tuple[Damage, str]] = [
 
 
 @pytest.mark.parametrize(("damage", "field"), DAMAGES, ids=lambda value: getattr(value, "__name__", None))
-def test_a_fault_is_refused_by_name_even_under_a_fitting_digest(policy_bytes: bytes, damage: Damage, field: str) -> None:
+def test_a_fault_is_refused_by_name_even_under_a_fitting_digest(
+    policy_bytes: bytes, damage: Damage, field: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = damaged(policy_bytes, damage, sealed=False)
     # Where the reader already refuses the structure there is nothing to seal; the check below says whether for the right reason.
     with contextlib.suppress(PolicyFileError):
@@ -224,6 +227,13 @@ def test_a_fault_is_refused_by_name_even_under_a_fitting_digest(policy_bytes: by
         check_policy_bytes(data)
     assert caught.value.field.startswith(field), caught.value
     assert "\n" not in str(caught.value)
+    # What `fly` calls before it starts anything, with the same answer, and without onnxruntime having seen the file.
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(data)
+    monkeypatch.setattr(runner.ort, "InferenceSession", None)
+    with pytest.raises(PolicyFileError) as again:
+        PolicyRunner.load(path)
+    assert str(again.value) == str(caught.value)
 
 
 def test_the_undamaged_file_passes_the_same_way(policy_bytes: bytes) -> None:
