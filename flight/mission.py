@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 from flight.errors import MissionError
 from flight.lidar.config import LidarSource
 from flight.px4 import LossAction
+from flight.recording_config import RecordingConfig
 from safety.config import SafetyConfig
 from safety.escalation import EscalationConfig
 from safety.frames import CorridorVector
@@ -138,6 +139,7 @@ class Mission(_Section):
     lidar: LidarSource = LidarSource()
     timeouts: TimeoutSection = TimeoutSection()
     failsafe: FailsafeSection = FailsafeSection()
+    recording: RecordingConfig = RecordingConfig()
     sim: SimSection | None = Field(default=None, validate_default=True)
 
     @property

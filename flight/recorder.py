@@ -38,7 +38,6 @@ FLUSH_EVERY_S = 0.5
 CHUNK_BYTES = 65_536
 CLOSE_S = 5.0
 MIN_FREE_BYTES = 100 * 1024 * 1024
-NOT_INSTALLED = "not recorded: foxglove-sdk is missing; pip install 'lstm-pilot[record]'"
 
 Notify = Callable[[str], None]
 
@@ -61,13 +60,13 @@ class FlightRecorder(Protocol):
         record: TickRecord,
         scan: LidarScan | None,
         state: VehicleState | None,
-        sent: SafeCommand,
+        sent: SafeCommand | None,
         sent_time_s: float,
         goal: CorridorVector,
         lateness_s: float = 0.0,
         deadline_misses: int = 0,
     ) -> None:
-        """Take one tick. `record` as `Pilot.tick` gave it, `sent` what really went out at `sent_time_s`."""
+        """Take one tick. `record` as `Pilot.tick` gave it, `sent` what really went out at `sent_time_s` (None: nothing)."""
 
     def event(self, text: str) -> None:
         """Take one line about what happened."""
@@ -84,7 +83,7 @@ class NoRecorder:
 
 
 class Recorder:
-    """Records one flight to `path` (None: live view only). A context manager; made by `open_recorder` in a flight.
+    """Records one flight to `path` (None: live view only). A context manager; made by `flight.recording_setup` in a flight.
 
     `policy`: bytes of the policy file, kept in the recording so that a replay needs nothing else. `notify` gets one line
     when recording has to stop. Raises `OSError` on entering when the file cannot be made, `RefusedError` when the live
@@ -105,6 +104,7 @@ class Recorder:
         self._path, self._header, self._policy, self._config = path, header, policy, config
         self._notify, self._clock = notify, clock
         self._ticks = 0
+        self._logged = False
         self._queue: queue.SimpleQueue[TickSample | tuple[str, float] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._file: _McapFile | None = None
@@ -114,7 +114,7 @@ class Recorder:
         from foxglove import Context  # noqa: PLC0415  (optional: extra `record`)
 
         with ExitStack() as undo:
-            context = Context()
+            self._context = context = Context()  # channels close when their context goes
             if self._config.live_port is not None:
                 self._live = start_live_view(context, self._config.live_host, self._config.live_port)
                 undo.callback(self._live.stop)
@@ -136,7 +136,7 @@ class Recorder:
         record: TickRecord,
         scan: LidarScan | None,
         state: VehicleState | None,
-        sent: SafeCommand,
+        sent: SafeCommand | None,
         sent_time_s: float,
         goal: CorridorVector,
         lateness_s: float = 0.0,
@@ -195,6 +195,7 @@ class Recorder:
     def _write(self, item: TickSample | tuple[str, float]) -> None:
         if isinstance(item, TickSample):
             self._guarded(lambda: self._channels.sample(item))
+            self._logged = True
             self.recorded += self._file is not None
         else:
             self._guarded(lambda: self._channels.event(*item))
@@ -204,7 +205,8 @@ class Recorder:
         file = self._file
         if file is None or not file.due(self._clock()):
             return
-        problem = self._guarded(file.keep)
+        problem = self._guarded(lambda: file.keep(self._logged))
+        self._logged = False
         if problem is not None:
             self._guarded(file.close)
             self._file = None
@@ -237,6 +239,7 @@ class _McapFile:
         self._descriptor = os.open(path, os.O_RDONLY)
         self._path = path
         self._max_bytes = max_size_mb * 1e6
+        self._size = 0
         self._kept_s = -math.inf
         self._closed = False
 
@@ -254,11 +257,14 @@ class _McapFile:
         self._kept_s = now_s
         return True
 
-    def keep(self) -> str | None:
-        """End the chunk and wait for the disk to have it. A reason to end the recording, or None."""
+    def keep(self, grown: bool) -> str | None:
+        """End the chunk and wait for the disk to have it. `grown`: something was logged since. A reason to end, or None."""
         self._writer.flush()
         os.fsync(self._descriptor)
-        size = os.fstat(self._descriptor).st_size
+        before, size = self._size, os.fstat(self._descriptor).st_size
+        self._size = size
+        if size == before and grown:
+            return "foxglove-sdk writes nothing"
         if size >= self._max_bytes:
             return f"{self._path.name} has reached recording.max_size_mb ({size / 1e6:.0f} MB)"
         space = os.fstatvfs(self._descriptor)
@@ -276,17 +282,3 @@ class _McapFile:
             os.fsync(self._descriptor)
         finally:
             os.close(self._descriptor)
-
-
-def open_recorder(
-    path: Path, header: FlightHeader, policy: bytes, config: RecordingConfig, notify: Notify
-) -> Recorder | None:
-    """A recorder for a flight, or None where the mission wants none or foxglove-sdk is missing (said once, in one line)."""
-    if not config.enabled and config.live_port is None:
-        return None
-    try:
-        import foxglove  # noqa: F401, PLC0415  (optional: extra `record`)
-    except ImportError:
-        notify(NOT_INSTALLED)
-        return None
-    return Recorder(path if config.enabled else None, header, policy, config, notify)

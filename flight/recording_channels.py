@@ -37,7 +37,7 @@ _COMMAND = {"vx_m_s": _NUMBER, "vy_m_s": _NUMBER, "vz_m_s": _NUMBER, "yaw_rate_r
 _RULES = {"type": "array", "items": {"type": "object", "properties": {"rule": _TEXT, "value": _NUMBER, "limit": _NUMBER}}}
 JSON_CHANNELS: dict[str, tuple[str, dict[str, Any]]] = {
     "/command": ("lstm_pilot.Command", {"asked": _FLAG, **_COMMAND}),
-    "/safe_command": ("lstm_pilot.SafeCommand", {"changed": _FLAG, **_COMMAND}),
+    "/safe_command": ("lstm_pilot.SafeCommand", {"sent": _FLAG, "braking": _FLAG, **_COMMAND}),
     "/verdict": (
         "lstm_pilot.Verdict",
         {
@@ -163,7 +163,11 @@ class Channels:
         rules = [{"rule": i.rule, "value": _known(i.value), "limit": _known(i.limit)} for i in verdict.interventions]
         documents: dict[str, dict[str, Any]] = {
             "/command": {"asked": wanted is not None, **_command(wanted)},
-            "/safe_command": {"changed": bool(verdict.interventions) or sample.sent != record.sent, **_command(sample.sent)},
+            "/safe_command": {
+                "sent": sample.sent is not None,
+                "braking": sample.sent != record.sent or verdict.braking,
+                **_command(sample.sent),
+            },
             "/verdict": {
                 "braking": verdict.braking,
                 "fault": verdict.fault or "",

@@ -15,7 +15,7 @@ import platform
 import struct
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from importlib import metadata
@@ -31,7 +31,6 @@ from safety.config import SafetyConfig
 from safety.frames import CorridorVector
 from safety.messages import LidarScan, SafeCommand, VehicleState
 
-FORMAT = 1
 HEADER_TOPIC = "/flight"
 SCAN_TOPIC = "/replay/scan"
 TICK_TOPIC = "/replay/tick"
@@ -41,7 +40,9 @@ MAX_BEAMS = 16_384
 UNMEASURED = ("inference_s",)
 """Fields of a `TickRecord` that measure the computer, not the flight: recorded, never compared."""
 
-_SIMD = frozenset(("sse4_2", "avx", "avx2", "fma", "avx512f", "avx512_vnni", "avx512_bf16", "amx_tile", "asimd", "asimddp", "sve"))
+_SIMD = frozenset(
+    ("sse4_2", "avx", "avx2", "fma", "avx512f", "avx512_vnni", "avx512_bf16", "amx_tile", "asimd", "asimddp", "sve")
+)
 _LIBRARIES = ("lstm-pilot", "numpy", "onnxruntime")
 
 T = TypeVar("T")
@@ -63,9 +64,7 @@ class Machine(BaseModel):
 
     def computes_like(self, other: Machine) -> bool:
         """Whether bit-identical results can be expected: same instructions, same numpy and onnxruntime."""
-        mine, theirs = (
-            (m.architecture, m.simd, m.libraries.get("numpy"), m.libraries.get("onnxruntime")) for m in (self, other)
-        )
+        mine, theirs = ((m.architecture, m.simd, m.libraries.get("numpy"), m.libraries.get("onnxruntime")) for m in (self, other))
         return mine == theirs
 
 
@@ -79,7 +78,7 @@ class FlightHeader(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    format: Literal[1] = FORMAT
+    format: Literal[1] = 1
     mission: str = Field(max_length=100)
     clock_offset_ns: int
     rate_hz: float
@@ -110,15 +109,15 @@ class TickSample:
     """One tick as it goes into a recording.
 
     `tick`: counts from 0, gaps are ticks that were not recorded. `scan`, `state`: what the tick was given. `record`: what
-    `Pilot.tick` made of it; `sent`: what really went out (an escalation may have stopped the vehicle), handed over at
-    `sent_time_s`. `lateness_s`: how late the tick woke up. `deadline_misses`, `dropped`: counts so far.
+    `Pilot.tick` made of it; `sent`: what really went out at `sent_time_s` (an escalation may have stopped the
+    vehicle), None and NaN where nothing did. `lateness_s`: how late the tick woke up. `deadline_misses`, `dropped`: so far.
     """
 
     tick: int
     record: TickRecord
     scan: LidarScan | None
     state: VehicleState | None
-    sent: SafeCommand
+    sent: SafeCommand | None
     sent_time_s: float
     goal: CorridorVector
     lateness_s: float = 0.0
@@ -215,8 +214,8 @@ def _read(hint: Any, value: Any) -> Any:
 
 
 @cache
-def _hints(kind: type[Any]) -> dict[str, Any]:
-    return typing.get_type_hints(kind)
+def _hints(kind: Hashable) -> dict[str, Any]:
+    return typing.get_type_hints(typing.cast(type, kind))
 
 
 def _dumps(document: dict[str, Any]) -> str:

@@ -38,6 +38,17 @@ class Recovery:
         """Bytes at the end of the file that could not be read."""
         return self.size_bytes - self.salvage.bytes_read
 
+    def as_dict(self) -> dict[str, object]:
+        """For --json."""
+        return {
+            "output": str(self.output) if self.output is not None else None,
+            "messages": self.messages,
+            "duration_s": self.duration_s,
+            "lost_bytes": self.lost_bytes,
+            "damaged_chunks": self.salvage.damaged_chunks,
+            "cut": self.salvage.cut,
+        }
+
     def describe(self) -> str:
         """One line for the user."""
         saved = f"{self.messages} messages, {self.duration_s:.1f} s"
@@ -118,11 +129,9 @@ def _copy(records: Iterator[Any], sink: IO[bytes]) -> None:
                 record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
             )
         elif isinstance(record, kinds.Message) and record.channel_id in channels:
-            writer.add_message(
-                channels[record.channel_id], record.log_time, record.data, record.publish_time, record.sequence
-            )
+            writer.add_message(channels[record.channel_id], record.log_time, record.data, record.publish_time, record.sequence)
         elif isinstance(record, kinds.Attachment):
             writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
         elif isinstance(record, kinds.Metadata):
             writer.add_metadata(record.name, record.metadata)
-    writer.finish()
+    writer.finish()  # type: ignore[no-untyped-call]
