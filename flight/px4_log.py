@@ -67,8 +67,8 @@ def _fetch(plugin: Any, target: Path, stop: StopRequest, list_deadline_s: float)
     listing = _Answer()
     plugin.get_entries_async(listing.on_entries)
     _wait(listing.done, lambda: stop.count > signals, list_deadline_s)
-    if not listing.done.is_set():
-        return f"no PX4 log: the vehicle did not list its logs within {list_deadline_s:g} s"
+    if not listing.done.is_set() or listing.result == "TIMEOUT":
+        return f"no PX4 log: the vehicle did not list its logs (asked for at most {list_deadline_s:g} s)"
     if listing.result != "SUCCESS" or not listing.entries:
         return f"no PX4 log: the vehicle has none to give ({listing.result.lower().replace('_', ' ')})"
     newest = max(listing.entries, key=lambda entry: int(entry.id))

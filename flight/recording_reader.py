@@ -40,11 +40,12 @@ _NOT_INSTALLED = "reading recordings needs the mcap package: pip install 'lstm-p
 
 @dataclass(slots=True)
 class Salvage:
-    """What came of reading a file record by record. `cut`: why reading ended before the file's own end, None for a whole file."""
+    """What came of reading a file record by record. `damaged`: chunks (or single records) left out. `cut`: why reading ended
+    before the file's own end, None for a whole file.
+    """
 
     bytes_read: int = 0
-    chunks: int = 0
-    damaged_chunks: int = 0
+    damaged: int = 0
     cut: str | None = None
 
 
@@ -66,9 +67,9 @@ def salvaged_records(file: IO[bytes], salvage: Salvage) -> Iterator[Any]:
             salvage.cut = None if _has_end(file) else "the file's index is missing"
             return
         if opcode == records.Opcode.CHUNK:
-            yield from _chunk_records(content, salvage)
+            yield from _intact(_unpacked(content), salvage)
         else:
-            yield from _decoded(opcode, content)
+            yield from _intact(_decoded(opcode, content), salvage)
 
 
 def _read_framed(file: IO[bytes], salvage: Salvage) -> tuple[int, bytes] | None:
@@ -98,18 +99,17 @@ def _has_end(file: IO[bytes]) -> bool:
     return file.read() == MAGIC
 
 
-def _chunk_records(content: bytes, salvage: Salvage) -> Iterator[Any]:
-    salvage.chunks += 1
+def _intact(found: Iterator[Any], salvage: Salvage) -> list[Any]:
+    """All the records of a chunk, or none of them where it is damaged."""
     try:
-        found = list(_unpacked(content))
-    except _DAMAGE:
-        salvage.damaged_chunks += 1
-        return
-    yield from found
+        return list(found)
+    except (ValueError, struct.error, EOFError, IndexError, KeyError, MemoryError, mcap_records().McapError):
+        salvage.damaged += 1
+        return []
 
 
 def _unpacked(content: bytes) -> Iterator[Any]:
-    """The records in a chunk. Raises one of `_DAMAGE`."""
+    """The records in a chunk. Raises what `_intact` catches."""
     records = mcap_records()
     chunk = records.Chunk.read(records.ReadDataStream(io.BytesIO(content)))
     data = _decompressed(chunk)
@@ -135,13 +135,15 @@ def _decompressed(chunk: Any) -> bytes:
     import zstandard  # noqa: PLC0415  (comes with mcap)
 
     try:
+        if zstandard.frame_content_size(chunk.data) > MAX_RECORD_BYTES:  # -1: not stated
+            raise ValueError("chunk too large")
         return zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.uncompressed_size)
     except zstandard.ZstdError as error:
         raise ValueError(str(error)) from None
 
 
 def _decoded(opcode: int, content: bytes) -> Iterator[Any]:
-    """A record as an object of `mcap.records`, if it is of a kind that carries something. Raises one of `_DAMAGE`."""
+    """A record as an object of `mcap.records`, if it is of a kind that carries something. Raises what `_intact` catches."""
     records = mcap_records()
     stream = records.ReadDataStream(io.BytesIO(content))
     kind = records.kinds.get(opcode)
@@ -151,19 +153,18 @@ def _decoded(opcode: int, content: bytes) -> Iterator[Any]:
         yield kind.read(stream)
 
 
-_DAMAGE = (ValueError, struct.error, EOFError, IndexError, KeyError, MemoryError)
-
-
 class _Mcap:
     """The parts of the mcap package that are used, imported when the first recording is read."""
 
     def __init__(self) -> None:
         try:
             from mcap.data_stream import ReadDataStream  # noqa: PLC0415
+            from mcap.exceptions import McapError  # noqa: PLC0415
             from mcap.opcode import Opcode  # noqa: PLC0415
             from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, Schema  # noqa: PLC0415
         except ImportError:
             raise RecordingError(_NOT_INSTALLED) from None
+        self.McapError = McapError
         self.ReadDataStream, self.Opcode, self.Message, self.Chunk = ReadDataStream, Opcode, Message, Chunk
         self.Schema, self.Channel, self.Attachment, self.Metadata = Schema, Channel, Attachment, Metadata
         self.kinds: dict[int, Any] = {

@@ -193,7 +193,7 @@ def to_plain(value: Any) -> Any:
 
 def from_plain(kind: type[T], value: Any) -> T:
     """Inverse of `to_plain` for a dataclass of messages. Raises `KeyError`, `TypeError` or `ValueError`."""
-    hints = _hints(kind)
+    hints = _hints(typing.cast(Hashable, kind))
     return kind(**{name: _read(hint, value[name]) for name, hint in hints.items()})
 
 

@@ -35,8 +35,8 @@ class Recovery:
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes at the end of the file that could not be read."""
-        return self.size_bytes - self.salvage.bytes_read
+        """Bytes at the end of a cut file that could not be read."""
+        return self.size_bytes - self.salvage.bytes_read if self.salvage.cut is not None else 0
 
     def as_dict(self) -> dict[str, object]:
         """For --json."""
@@ -45,7 +45,7 @@ class Recovery:
             "messages": self.messages,
             "duration_s": self.duration_s,
             "lost_bytes": self.lost_bytes,
-            "damaged_chunks": self.salvage.damaged_chunks,
+            "damaged": self.salvage.damaged,
             "cut": self.salvage.cut,
         }
 
@@ -54,7 +54,7 @@ class Recovery:
         saved = f"{self.messages} messages, {self.duration_s:.1f} s"
         if self.output is None:
             return f"nothing to recover: the file is whole ({saved})"
-        damaged = f", {self.salvage.damaged_chunks} damaged chunk(s) left out" if self.salvage.damaged_chunks else ""
+        damaged = f", {self.salvage.damaged} damaged part(s) left out" if self.salvage.damaged else ""
         return f"{self.output}: {saved}; {self.salvage.cut or 'damaged'}, {self.lost_bytes} bytes lost{damaged}"
 
 
@@ -66,7 +66,7 @@ def recover(path: Path, output: Path | None = None) -> Recovery:
     target = output if output is not None else path.with_name(f"{path.stem}-recovered{path.suffix}")
     try:
         result = _inspect(path)
-        if result.salvage.cut is None and not result.salvage.damaged_chunks:
+        if result.salvage.cut is None and not result.salvage.damaged:
             return result
         if result.messages == 0:
             raise RecordingError(f"{path}: no message in it can be read; there is nothing to recover")

@@ -18,9 +18,7 @@ def run_replay(file: Path, policy: Path | None, tolerance: float, as_json: bool)
     """Replay `file` and print what came of it. Raises `RecordingError`."""
     recording = read_recording(file)
     if recording.salvage.cut is not None:
-        print(
-            f"fly: {file}: {recording.salvage.cut}; what is there is replayed (fly recover makes a whole file)", file=sys.stderr
-        )
+        sys.stderr.write(f"fly: {file}: {recording.salvage.cut}; what is there is replayed (fly recover makes it whole)\n")
     if policy is not None:
         other = compare_policy(recording, policy, recording.header.rate_hz)
         _print(json.dumps(dataclasses.asdict(other)) if as_json else describe_policy(other, recording))
