@@ -1,4 +1,4 @@
-"""One step of a policy at batch 1: the runner that flies beside bare onnxruntime and PyTorch, taking turns in one run."""
+"""One step of a policy at batch 1: the runner that flies beside bare onnxruntime, PyTorch and SB3, taking turns in one run."""
 
 from __future__ import annotations
 
@@ -61,6 +61,38 @@ def _files() -> tuple[Any, dict[str, Any]]:
     return network, files
 
 
+def _sb3() -> tuple[Any, Callable[[], object]]:
+    """A RecurrentPPO of sb3-contrib of the same sizes as its policy file, and a step of its own `predict`."""
+    import tempfile
+    from pathlib import Path
+
+    import gymnasium
+    from gymnasium import spaces
+    from sb3_contrib import RecurrentPPO
+
+    from policy_export.export import export_checkpoint
+    from policy_export.policy_file import read_policy_file
+
+    class Spaces(gymnasium.Env[Any, Any]):
+        observation_space = spaces.Box(-np.inf, np.inf, (190,), np.float32)
+        action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+
+    model = RecurrentPPO("MlpLstmPolicy", Spaces(), policy_kwargs={"lstm_hidden_size": 128}, device="cpu", seed=0)
+    with tempfile.TemporaryDirectory() as folder:
+        model.save(Path(folder) / "model.zip")
+        export_checkpoint(Path(folder) / "model.zip", Path(folder) / "policy.onnx")
+        file = read_policy_file(Path(folder) / "policy.onnx")
+    inputs = np.random.default_rng(0).uniform(0.0, 4.0, size=(64, 190)).astype(np.float32)
+    state: list[Any] = [None]
+    count = iter(range(10**9))
+
+    def step() -> object:
+        action, state[0] = model.predict(inputs[next(count) % 64], state=state[0], deterministic=True)
+        return action
+
+    return file, step
+
+
 def run(json: bool) -> list[dict[str, Any]]:
     """Medians and 99th percentiles per step, microseconds; ratios within this run."""
     import torch
@@ -69,6 +101,7 @@ def run(json: bool) -> list[dict[str, Any]]:
 
     torch.set_num_threads(1)
     network, files = _files()
+    sb3_file, sb3_predict = _sb3()
     shipped = files[DEFAULT_MEMORY_FORM]
     candidates = {
         "runner": runner_step(shipped),
@@ -77,6 +110,8 @@ def run(json: bool) -> list[dict[str, Any]]:
         "written-out gates": bare_step(files["gates"].data, files["gates"]),
         "torch eager, nn.LSTM": _eager_step(network, fused=True),
         "torch eager, gates": _eager_step(network, fused=False),
+        "runner of the exported SB3 policy": runner_step(sb3_file),
+        "SB3 predict": sb3_predict,
     }
     if not json:
         print(f"   timing {STEPS} steps of {len(candidates)} candidates in turns", file=sys.stderr, flush=True)
@@ -96,6 +131,11 @@ def _figures(times: dict[str, tuple[float, float]], form: str) -> list[dict[str,
             eager = times[peer][rank]
             target = f">= {EAGER_TARGET}" if rank == 0 and peer.endswith("nn.LSTM") else None
             figures.append(_figure(f"{peer}, {label}, to runner", value, eager, eager / value, target, EAGER_TARGET))
+        own, predict = times["runner of the exported SB3 policy"][rank], times["SB3 predict"][rank]
+        target = f">= {EAGER_TARGET}" if rank == 0 else None
+        figures.append(
+            _figure(f"SB3 predict, {label}, to runner of its export", own, predict, predict / own, target, EAGER_TARGET)
+        )
         fused, gates = times["fused LSTM node"][rank], times["written-out gates"][rank]
         chosen, other = (fused, gates) if form == "fused" else (gates, fused)
         figures.append(

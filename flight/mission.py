@@ -7,6 +7,7 @@ refused before anything is started. Paths in the file are relative to the file's
 from __future__ import annotations
 
 import math
+import os
 import re
 from pathlib import Path
 from typing import Annotated, Literal
@@ -235,7 +236,7 @@ def load_mission(path: str | Path, seed: int | None = None) -> Mission:
 
 
 def _resolve(mission_file: Path, path: Path) -> Path:
-    return path if path.is_absolute() else (mission_file.parent / path)
+    return path if path.is_absolute() else Path(os.path.normpath(mission_file.parent / path))
 
 
 def _raise(problem: str | None) -> None:

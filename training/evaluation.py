@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from typing import Any
 
@@ -13,16 +12,8 @@ from policy_export.contract import ActionLayout, ObservationLayout
 from policy_export.network import PolicyNetwork
 from training.config import EVALUATION_SEED_START, EnvironmentConfig, EvaluationConfig
 from training.environment import CorridorVectorEnv
+from training.intervals import wilson_interval
 from training.worlds import FixedWorlds, world_for_seed
-
-
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95 % score interval of a rate (Wilson 1927)."""
-    z = 1.959963984540054
-    rate, spread = successes / trials, z * z / trials
-    centre = (rate + 0.5 * spread) / (1.0 + spread)
-    half = z / (1.0 + spread) * math.sqrt(rate * (1.0 - rate) / trials + spread / (4.0 * trials))
-    return max(0.0, centre - half), min(1.0, centre + half)
 
 
 def evaluation_environment(

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from campaigns.statistics import EpisodeResult, mean, proportion, summarise, wilson_interval
+from campaigns.statistics import EpisodeResult, mean, proportion, summarise
+from training.intervals import wilson_interval
 
 
 def episode(seed: int = 0, *, success: bool = True, contacts: int = 0, failure: str | None = None) -> EpisodeResult:

@@ -46,7 +46,8 @@ def test_the_shipped_mission_is_valid_and_names_existing_files() -> None:
     assert mission.sim is not None
     assert mission.sim.seed == 17
     assert mission.sim.world.exists()
-    assert mission.goal.radius_m == 0.3
+    assert mission.policy.path.exists()
+    assert mission.goal.radius_m < 0.3  # arrival is judged by the estimate, the task by the truth
     assert mission.failsafe.loss_action == LossAction.HOLD == 5
 
 

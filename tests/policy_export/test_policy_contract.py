@@ -19,11 +19,13 @@ from policy_export.contract import (
     ResetRules,
     VerificationRecord,
     default_layout,
+    foreign_fields,
     paper_layout,
     parse_metadata,
     training_record,
 )
 from policy_export.errors import PolicyFileError
+from policy_export.observation import ObservationBuilder
 
 VERIFICATION = VerificationRecord(
     steps=1000,
@@ -163,3 +165,57 @@ def test_unknown_training_keys_are_kept_as_details() -> None:
 def test_a_record_of_a_failed_verification_cannot_exist() -> None:
     with pytest.raises(ValidationError, match="exceeds the tolerance"):
         VerificationRecord.model_validate(VERIFICATION.model_dump() | {"max_abs_difference": 1e-4})
+
+
+def other(size: int = 2, **changes: object) -> dict[str, object]:
+    return {"name": "other_wind", "unit": "m/s", "frame": "none", "start": 0, "stop": size} | changes
+
+
+def test_other_channels_are_carried_with_any_width_and_named_as_foreign() -> None:
+    layout = ObservationLayout.model_validate({"size": 2, "channels": [other()]})
+    assert layout.lidar == LidarSpec()
+    found = metadata(observation=layout)
+    assert parse_metadata(found.to_json()) == found
+    assert foreign_fields(found) == ["observation.channels.0.name other_wind"]
+    assert foreign_fields(metadata()) == []
+    with pytest.raises(PolicyFileError, match=r"channels\.0\.name"):
+        ObservationBuilder(layout)
+
+
+@pytest.mark.parametrize("change", [{"name": "wind"}, {"name": "otherwind"}, {"unit": ""}, {"start": 2}, {"frame": "ned"}])
+def test_a_channel_is_either_known_or_called_other(change: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        ObservationLayout.model_validate({"size": 2, "channels": [other() | change]})
+
+
+def test_an_action_of_another_kind_is_foreign() -> None:
+    torque = ActionLayout(frame="none", names=("other_torque",), low=(-200.0,), high=(200.0,))
+    assert foreign_fields(metadata(action=torque)) == ["action.names other_torque"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"names": ("vx", "vy")},
+        {"names": ("vx", "vy", "vz", "other")},
+        {"names": ("other", "other", "other_a", "other_b"), "frame": "none"},
+        {"names": ("other",), "frame": "none"},
+        {"frame": "none"},
+        {"names": ("other_a", "other_b", "other_c", "other_d")},
+        {"low": (0.0, -0.5, -0.5), "high": (1.0, 0.5, 0.5)},
+        {"low": (0.2, -0.5, -0.5, -1.0), "high": (0.2, 0.5, 0.5, 1.0)},
+    ],
+)
+def test_an_action_is_a_whole_velocity_command_or_called_other(change: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        ActionLayout.model_validate(change)
+
+
+def test_an_axis_that_is_not_used_is_fixed_at_zero() -> None:
+    assert ActionLayout(low=(-0.5, 0.0, 0.0, -1.0), high=(1.0, 0.0, 0.0, 1.0)).is_velocity
+
+
+@pytest.mark.parametrize("change", [{"layers": 0}, {"layers": 9}, {"memory": "none", "hidden_size": 0, "layers": 2}])
+def test_layers_are_those_that_a_file_may_have(change: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        metadata(**change)

@@ -20,7 +20,8 @@ from strict_yaml import load_config
 from training import cli
 from training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from training.config import EvaluationConfig, PpoConfig, TrainingConfig
-from training.evaluation import evaluate, evaluation_environment, wilson_interval
+from training.evaluation import evaluate, evaluation_environment
+from training.intervals import wilson_interval
 from training.ppo import correlated_log_prob, evaluate_sequences
 from training.trainer import Trainer, hold_ticks, layouts
 
