@@ -56,7 +56,7 @@ def header_of(flight: LockstepFlight, policy: PolicyRunner) -> FlightHeader:
     )
 
 
-def record_lockstep(path: Path, policy: Path, *, seed: int = 3, duration_s: float = 8.0) -> list[TickRecord]:
+def record_lockstep(path: Path, policy: Path, *, seed: int = 1, duration_s: float = 10.0) -> list[TickRecord]:
     """Fly `duration_s` of a generated corridor and record it to `path`; the ticks as flown."""
     runner = PolicyRunner.load(policy)
     world = load_world(ROOT / "configs" / "worlds" / "corridor.yaml", seed)

@@ -23,7 +23,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from recorded_flight import EPOCH_NS, SAFETY, record_lockstep
 from stand import free_port
 
-from flight.errors import RefusedError
+from flight.errors import MissionError, RefusedError
 from flight.mission import load_mission
 from flight.recorder import QUEUE_TICKS, Recorder
 from flight.recording_channels import body_to_corridor, turned_back
@@ -164,8 +164,15 @@ verdicts = st.builds(
 states = st.builds(VehicleState, numbers, vectors, vectors, vectors, numbers, numbers, numbers, numbers)
 
 
-@given(verdict=verdicts, state=st.none() | states, numbers=st.lists(numbers, min_size=5, max_size=5), number=st.none() | st.integers(0))
-def test_any_tick_survives_as_json(verdict: Verdict, state: VehicleState | None, numbers: list[float], number: int | None) -> None:
+@given(
+    verdict=verdicts,
+    state=st.none() | states,
+    numbers=st.lists(numbers, min_size=5, max_size=5),
+    number=st.none() | st.integers(0),
+)
+def test_any_tick_survives_as_json(
+    verdict: Verdict, state: VehicleState | None, numbers: list[float], number: int | None
+) -> None:
     a, b, c, d, e = numbers
     one = record(0, now_s=a, yaw_rad=b, hidden_norm=c, verdict=verdict, position=None, wanted=None)
     sample = TickSample(7, one, None, state, SafeCommand(CorridorVector(d, e, a), b), c, CorridorVector(a, b, d), e, 3, 4)
@@ -316,6 +323,14 @@ def test_a_folder_that_cannot_be_written_is_refused_before_arming(tmp_path: Path
     started = flight_header(mission, PolicyRunner.load(seeker_policy), GOAL)
     with pytest.raises(RefusedError, match="cannot record to"), record_flight(mission, tmp_path / "gone", started, print):
         pytest.fail("recorded into a folder that is not there")
+
+
+@pytest.mark.parametrize(
+    "section", ["{live_prot: 8765}", "{live_port: 70000}", "{max_size_mb: .inf}", "{enabled: maybe}", "{max_size_mb: 0}"]
+)
+def test_a_wrong_section_is_named(tmp_path: Path, seeker_policy: Path, section: str) -> None:
+    with pytest.raises(MissionError, match="recording"):
+        _mission(tmp_path, seeker_policy, f"recording: {section}\n")
 
 
 def _mission(folder: Path, policy: Path, more: str = "") -> Any:

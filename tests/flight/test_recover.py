@@ -95,23 +95,19 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path, whole: bytes) -> None
 
 
 def test_no_damage_ends_in_anything_but_one_line(tmp_path: Path, whole: bytes) -> None:
-    """Three hundred random mutations: recovered, or refused by name. Never another exception, never a made-up message."""
+    """Three hundred random mutations: read, recovered or refused by name. Never another exception, never a made-up message."""
     random.seed(2)
-    known = set(messages(whole))
-    short = whole[-150_000:]
+    genuine = {content for _, _, content in messages(whole)}
     for number in range(300):
-        data = bytearray(whole[:8] + short if number % 3 == 0 else whole)
+        data = bytearray(whole[-150_000:] if number % 3 == 0 else whole)
+        data[:8] = whole[:8]
         for _ in range(random.randint(1, 20)):
             data[random.randrange(8, len(data))] = random.randrange(256)
         salvage = Salvage()
-        try:
-            for record in salvaged_records(io.BytesIO(bytes(data)), salvage):
-                if type(record).__name__ == "Message":
-                    known.add(("", record.log_time, record.data))
-        except RecordingError as error:
-            assert "\n" not in str(error)
-        if number % 30 == 0 and (made := recovered(tmp_path, bytes(data))) is not None:
-            messages(made) if made != bytes(data) else None
+        found = [r for r in salvaged_records(io.BytesIO(data), salvage) if type(r).__name__ == "Message"]
+        assert {record.data for record in found} <= genuine
+        if number % 30 == 0:
+            recovered(tmp_path, bytes(data))
 
 
 def test_an_existing_file_is_never_replaced(tmp_path: Path, whole: bytes) -> None:
@@ -176,5 +172,3 @@ def test_replay_takes_a_cut_file_as_it_is(tmp_path: Path, whole: bytes) -> None:
     assert program.finish(60.0) == 0, program.err
     assert json.loads(program.out)["identical"] is True
     assert "fly recover makes it whole" in program.err
-
-
