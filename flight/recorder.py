@@ -163,7 +163,7 @@ class Recorder:
             self._queue.put(None)
             self._thread.join(CLOSE_S)
             if self._thread.is_alive():
-                self._stop_recording(f"the disk did not take the rest of it within {CLOSE_S:g} s")
+                self._complain(f"recording incomplete: the disk did not take the rest within {CLOSE_S:g} s")
         live, self._live = self._live, None
         if live is not None:
             live.stop()
@@ -187,44 +187,56 @@ class Recorder:
                 break
             self._write(item)
             self._keep_safe()
-        if self._file is not None:
-            self._guarded(self._file.close)
+        self._end_file(None)
         if self._ticks == 0 and self._path is not None:
             self._path.unlink(missing_ok=True)  # nothing was flown
 
     def _write(self, item: TickSample | tuple[str, float]) -> None:
-        if isinstance(item, TickSample):
-            self._guarded(lambda: self._channels.sample(item))
+        """One tick or event into all channels. What cannot be written is lost alone, counted and said once."""
+        try:
+            if isinstance(item, TickSample):
+                self._channels.sample(item)
+                self.recorded += self._file is not None
+            else:
+                self._channels.event(*item)
             self._logged = True
-            self.recorded += self._file is not None
-        else:
-            self._guarded(lambda: self._channels.event(*item))
+        except Exception as error:  # noqa: BLE001  foxglove-sdk documents no exceptions; none may end the thread
+            self.dropped += isinstance(item, TickSample)
+            self._complain(f"recording incomplete: {_one_line(error)}")
 
     def _keep_safe(self) -> None:
         """Every half second: end the chunk, let the disk keep it, look at size and space."""
         file = self._file
         if file is None or not file.due(self._clock()):
             return
-        problem = self._guarded(lambda: file.keep(self._logged))
+        try:
+            problem = file.keep(self._logged)
+        except Exception as error:  # noqa: BLE001  as above
+            problem = _one_line(error)
         self._logged = False
         if problem is not None:
-            self._guarded(file.close)
-            self._file = None
-            self._stop_recording(problem)
+            self._end_file(problem)
 
-    def _guarded(self, action: Callable[[], Any]) -> Any:
-        """Whatever goes wrong in here must not end the thread that the live view and the file depend on."""
+    def _end_file(self, problem: str | None) -> None:
+        """Close the file, with its index if that is still possible."""
+        file, self._file = self._file, None
         try:
-            return action()
-        except Exception as error:  # noqa: BLE001  foxglove-sdk documents no exceptions; none of them may end a flight
-            self._file = None
-            self._stop_recording(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
-            return None
+            if file is not None:
+                file.close()
+        except Exception as error:  # noqa: BLE001  as above
+            problem = problem or _one_line(error)
+        if problem is not None:
+            self._complain(f"recording stopped: {problem}")
 
-    def _stop_recording(self, problem: str) -> None:
+    def _complain(self, problem: str) -> None:
+        """Say the first problem; the summary keeps it."""
         if self.problem is None:
             self.problem = problem
-            self._notify(f"recording stopped: {problem}")
+            self._notify(problem)
+
+
+def _one_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
 
 class _McapFile:

@@ -263,4 +263,4 @@ def _command(command: Any) -> dict[str, float | None]:
 
 
 def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    return float(value) if math.isfinite(value) else None

@@ -45,6 +45,9 @@ _SIMD = frozenset(
 )
 _LIBRARIES = ("lstm-pilot", "numpy", "onnxruntime")
 
+_LATEST_NS = (2**32 - 1) * 1_000_000_000
+"""Foxglove's timestamps have 32 bits of seconds."""
+
 T = TypeVar("T")
 
 
@@ -100,8 +103,9 @@ class FlightHeader(BaseModel):
         return CorridorVector(*self.goal_m)
 
     def unix_ns(self, time_s: float) -> int:
-        """Unix time, ns, of a time on the flight's own clock; 0 where there is none."""
-        return max(0, self.clock_offset_ns + round(1e9 * time_s)) if math.isfinite(time_s) else 0
+        """Unix time, ns, of a time on the flight's own clock; 0 where there is none, and no later than a viewer can show."""
+        elapsed_ns = 1e9 * time_s
+        return min(max(0, self.clock_offset_ns + round(elapsed_ns)), _LATEST_NS) if math.isfinite(elapsed_ns) else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +186,7 @@ def decode_event(text: bytes) -> str:
 
 def to_plain(value: Any) -> Any:
     """A message as JSON has it: dataclasses become objects, and a float that JSON lacks becomes the string nan, inf or -inf."""
+    value = value.item() if isinstance(value, np.generic) else value
     if value is None or isinstance(value, (str, bool, int)):
         return value
     if isinstance(value, float):
@@ -245,7 +250,7 @@ def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
         for index, item in enumerate(value):
             yield from leaves(item, f"{name}[{index}]")
     else:
-        yield name, value
+        yield name, value.item() if isinstance(value, np.generic) else value
 
 
 def same_bits(a: Any, b: Any) -> bool:

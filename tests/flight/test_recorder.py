@@ -288,6 +288,35 @@ def test_a_disk_that_takes_no_more_ends_the_recording_not_the_flight(tmp_path: P
     assert read_recording(tmp_path / "flight.mcap").ticks
 
 
+def test_a_tick_that_cannot_be_written_is_lost_alone(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    said: list[str] = []
+    with Recorder(path, header(), b"", RecordingConfig(), said.append) as recorder:
+        feed(recorder, 3)
+        bad = record(3, verdict=object())
+        recorder.tick(bad, None, None, None, math.nan, GOAL)
+        feed(recorder, 3, 4)
+    assert len(said) == 1
+    assert said[0].startswith("recording incomplete: AttributeError")
+    assert recorder.dropped == 1
+    assert [sample.tick for sample in read_recording(path).ticks] == [0, 1, 2, 4, 5, 6]
+
+
+@pytest.mark.parametrize("time_s", [math.nan, math.inf, -math.inf, 1e300, -1e300, 1e12])
+def test_times_that_no_viewer_can_show_are_recorded_all_the_same(tmp_path: Path, time_s: float) -> None:
+    path = tmp_path / "flight.mcap"
+    one = record(0, now_s=time_s, scan_time_s=time_s, hidden_norm=np.float32(0.1))
+    said: list[str] = []
+    with Recorder(path, header(), b"", RecordingConfig(), said.append) as recorder:
+        recorder.tick(one, scan_at(time_s), state_at(time_s), one.sent, time_s, GOAL)
+    assert said == []
+    sample = read_recording(path).ticks[0]
+    assert same_bits(sample.record.now_s, time_s)
+    assert sample.record.hidden_norm == float(np.float32(0.1))
+    assert sample.scan is not None
+    assert same_bits(sample.scan.time_s, time_s)
+
+
 def test_nothing_flown_leaves_no_file(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     with Recorder(path, header(), b"policy", RecordingConfig()) as recorder:
