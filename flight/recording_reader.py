@@ -34,6 +34,8 @@ from safety.messages import LidarScan
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 64 * 1024 * 1024
+MAX_TICKS = 1_000_000
+"""14 hours at 20 Hz."""
 _FRAME = struct.Struct("<BQ")
 _NOT_INSTALLED = "reading recordings needs the mcap package: pip install 'lstm-pilot[record]'"
 
@@ -253,6 +255,8 @@ class _Builder:
             self.events.append((message.log_time, decode_event(message.data)))
 
     def _tick(self, data: bytes) -> None:
+        if len(self.ticks) >= MAX_TICKS:
+            raise RecordingError(f"it holds more than {MAX_TICKS} ticks; no flight does")
         sample, number = decode_tick(data)
         if number is None:
             self.ticks.append(sample)

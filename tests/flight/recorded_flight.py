@@ -28,12 +28,14 @@ class RecordedPilot:
 
     def __init__(self, pilot: Pilot, recorder: Recorder) -> None:
         self._pilot, self._recorder = pilot, recorder
+        self.records: list[TickRecord] = []
 
     def reset(self) -> None:
         self._pilot.reset()
 
     def tick(self, scan: LidarScan | None, state: VehicleState | None, now_s: float) -> TickRecord:
         record = self._pilot.tick(scan, state, now_s)
+        self.records.append(record)
         self._recorder.tick(record, scan, state, record.sent, now_s + 0.001, self._pilot.goal)
         return record
 
@@ -63,12 +65,13 @@ def record_lockstep(path: Path, policy: Path, *, seed: int = 1, duration_s: floa
     flight = LockstepFlight(world, StackConfig(policy, SAFETY, time_limit_s=duration_s), runner)
     header, config = header_of(flight, runner), RecordingConfig()
     with Recorder(path, header, policy.read_bytes(), config, clock=lambda: flight.simulation.time_s) as recorder:
-        flight.pilot = RecordedPilot(flight.pilot, recorder)  # type: ignore[assignment]
+        pilot = RecordedPilot(flight.pilot, recorder)
+        flight.pilot = pilot  # type: ignore[assignment]
         recorder.event("the policy flies")
         flight.run()
         recorder.event("time is up")
     assert recorder.summary.problem is None
-    return flight.log.records
+    return pilot.records
 
 
 if __name__ == "__main__":
