@@ -36,8 +36,8 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.setup-fly: pyproject.toml constraints.txt | $(BIN)/python
-	@echo "== installing the flight stack, the simulator and the plots (no torch) =="
-	$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off -c constraints.txt -e ".[sim,report]"
+	@echo "== installing the flight stack, the simulator, recording and the plots (no torch) =="
+	$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off -c constraints.txt -e ".[sim,report,record]"
 	@touch $@
 
 $(VENV)/.setup-dev: pyproject.toml constraints.txt | $(BIN)/python

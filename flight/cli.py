@@ -19,16 +19,22 @@ fly --mission configs/corridor.yaml
 
 fly --mission configs/corridor.yaml --seed 17 --out runs/seed17 --json
 
+fly replay runs/seed17/flight.mcap
+
 Exit codes: 0 goal reached and landed, 1 ended safely without reaching the goal, 2 usage or configuration,
 3 preflight refused (nothing armed), 4 safety ended the flight. Ctrl-C brakes, holds and lands.
 """
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
+RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording: flight.mcap of a run folder.")]
+
 
 @app.callback(invoke_without_command=True, epilog=_EPILOG)
 def fly(
-    mission: Annotated[Path, typer.Option(help="Mission file (YAML), see docs/mission.md.")],
+    context: typer.Context,
+    mission: Annotated[Path | None, typer.Option(help="Mission file (YAML), see docs/mission.md.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default runs/<time>-<name>.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Replaces sim.seed: another corridor.")] = None,
     as_json: Annotated[
@@ -37,7 +43,58 @@ def fly(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before arming a real vehicle.")] = False,
 ) -> None:
     """Check, arm, take off, fly the policy to the goal in OFFBOARD, land, and write one folder of results."""
-    raise typer.Exit(_fly(mission, out, seed, as_json, yes))
+    if context.invoked_subcommand is None:
+        if mission is None:
+            raise MissionError("what is to be flown? Give a mission with --mission; see fly --help")
+        raise typer.Exit(_fly(mission, out, seed, as_json, yes))
+    if mission is not None or out is not None or seed is not None or as_json or yes:
+        raise MissionError(f"options of `fly {context.invoked_subcommand}` come after its name; see its --help")
+
+
+@app.command(epilog="Example:\n\nfly check --mission configs/corridor.yaml --json")
+def check(
+    mission: Annotated[Path, typer.Option(help="Mission file (YAML), see docs/mission.md.")],
+    apply: Annotated[bool, typer.Option("--apply", help="Also set the parameters that are wrong, and upload the fence.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Check everything that can be checked without arming, and say what to do about it."""
+    from flight.check_command import run_check
+
+    raise typer.Exit(run_check(mission, apply, as_json))
+
+
+@app.command(epilog="Example:\n\nfly report runs/seed17")
+def report(folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The run folder of a flight.")]) -> None:
+    """Write report.html (and trajectory.png) of a flight into its folder, from what was recorded."""
+    from flight.report import write_report
+
+    print(write_report(folder))
+
+
+@app.command(epilog="Example:\n\nfly recover runs/20261122-101500-corridor/flight.mcap")
+def recover(
+    file: RecordingFile,
+    out: Annotated[Path | None, typer.Option(help="The new file; default: FILE with -recovered in its name.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Make an indexed recording from one that a power cut or a SIGKILL left without its end. FILE is not changed."""
+    from flight import recover as recovery
+
+    result = recovery.recover(file, out)
+    print(json.dumps(result.as_dict()) if as_json else result.describe())
+
+
+@app.command(epilog="Examples:\n\nfly replay runs/seed17/flight.mcap\n\nfly replay runs/seed17/flight.mcap --policy other.onnx")
+def replay(
+    file: RecordingFile,
+    policy: Annotated[Path | None, typer.Option(help="Show where this policy would have decided otherwise.")] = None,
+    tolerance: Annotated[float, typer.Option(min=0.0, help="Numbers this near count as equal; 0 compares every bit.")] = 0.0,
+    as_json: Json = False,
+) -> None:
+    """Feed recorded inputs through policy and safety filter again, and compare. Exit code 1 when something differs."""
+    from flight.replay_command import run_replay
+
+    raise typer.Exit(run_replay(file, policy, tolerance, as_json))
 
 
 def _fly(mission_path: Path, out: Path | None, seed: int | None, as_json: bool, yes: bool) -> int:

@@ -60,6 +60,7 @@ class VehicleLink:
     def __init__(self, url: str, clock: Callable[[], float] = time.monotonic) -> None:
         self.url = url
         self.telemetry = Telemetry()
+        self.system: Any = None
         self.system_id = 0
         self.setpoints_sent = 0
         self._clock = clock
@@ -113,6 +114,7 @@ class VehicleLink:
         from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage  # noqa: PLC0415
         from mavsdk.plugins.param import Param  # noqa: PLC0415
 
+        self.system = system
         self.system_id = int(system.get_system_id())
         self._target = (self.system_id, AUTOPILOT_COMPONENT)
         self._message = MavlinkMessage
@@ -130,7 +132,7 @@ class VehicleLink:
 
     def close(self) -> None:
         """Drop the connection. Idempotent. The vehicle then sees no setpoint and no heartbeat from us."""
-        mavsdk, self._mavsdk = self._mavsdk, None
+        mavsdk, self._mavsdk, self.system = self._mavsdk, None, None
         self._direct = self._action = self._param = None
         if mavsdk is not None:
             mavsdk.destroy()

@@ -18,6 +18,7 @@ from flight.errors import MissionError
 from flight.lidar.config import LidarSource
 from flight.px4 import LossAction
 from flight.realtime import RealTimeConfig
+from flight.recording_config import RecordingConfig
 from safety.config import SafetyConfig
 from safety.escalation import EscalationConfig
 from safety.frames import CorridorVector
@@ -141,6 +142,7 @@ class Mission(_Section):
     timeouts: TimeoutSection = TimeoutSection()
     failsafe: FailsafeSection = FailsafeSection()
     realtime: RealTimeConfig = RealTimeConfig()
+    recording: RecordingConfig = RecordingConfig()
     sim: SimSection | None = Field(default=None, validate_default=True)
 
     @property

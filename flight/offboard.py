@@ -23,12 +23,13 @@ from flight.mission import Mission
 from flight.preflight import LOOP_RATE_HZ
 from flight.px4 import FlightMode, mode_name
 from flight.rate_keeper import RateKeeper
+from flight.recorder import FlightRecorder, NoRecorder
 from flight.status import Status
 from flight.tick import Pilot, TickRecord
 from flight.trajectory import FlightLog
 from safety.escalation import EscalationState, Level, escalate
 from safety.frames import CorridorFrame, CorridorVector
-from safety.messages import SafeCommand
+from safety.messages import LidarScan, SafeCommand, VehicleState
 
 STILL = SafeCommand(CorridorVector(0.0, 0.0, 0.0), 0.0)
 SETPOINTS_BEFORE_OFFBOARD_S = 1.0
@@ -67,6 +68,7 @@ class OffboardFlight:
         interrupt: Interrupt,
         status: Status,
         clock: Callable[[], float] = time.monotonic,
+        recorder: FlightRecorder | None = None,
     ) -> None:
         self.log = FlightLog(max_ticks=int(mission.timeouts.flight_s * LOOP_RATE_HZ) + 200)
         self.log.reserve()
@@ -81,6 +83,7 @@ class OffboardFlight:
         self._loss_certain_s = LOSS_CERTAINTY * mission.failsafe.setpoint_loss_timeout_s
         self._reboots = link.telemetry.clock.reboots
         self._judge = FlightJudge(mission)
+        self._recorder = recorder if recorder is not None else NoRecorder()
 
     def engage(self) -> None:
         """Stream zero velocity for a second, then command OFFBOARD. Raises `VehicleCommandError` when PX4 refuses."""
@@ -145,10 +148,11 @@ class OffboardFlight:
         if now_s - self._sent_s > self._mission.failsafe.stall_s:
             return self._after_stall(now_s)
         scan, state = self._lidar.latest(), self._link.state(self._frame)
-        record = self._pilot.tick(scan, state, now_s)
+        decided = record = self._pilot.tick(scan, state, now_s)
         if self._judge.pausing(record) and record.sent != STILL:
             record = replace(record, sent=STILL)
         if self._clock() - self._sent_s > self._loss_certain_s:  # held up since the tick began
+            self._record(decided, scan, state, None)
             return self._after_stall(self._clock())
         self._sent_s = self._link.send_velocity(record.sent, self._frame)
         self.log.append(record, self._sent_s, self.keeper.lateness_s)
@@ -156,7 +160,14 @@ class OffboardFlight:
         self._status.publish(record, self.keeper.deadline_misses)
         if self.keeper.ticks % TICKS_PER_TIME_QUESTION == 0:
             self._link.ask_time()
-        return self._judge.ending(record)
+        ending = self._judge.ending(record)
+        self._record(decided, scan, state, record.sent)
+        return ending
+
+    def _record(self, decided: TickRecord, scan: LidarScan | None, state: VehicleState | None, sent: SafeCommand | None) -> None:
+        """Leave the tick with the recorder, last of all: its writer then works while the loop sleeps."""
+        sent_s, keeper = self._sent_s if sent is not None else math.nan, self.keeper
+        self._recorder.tick(decided, scan, state, sent, sent_s, self._pilot.goal, keeper.lateness_s, keeper.deadline_misses)
 
     def _after_stall(self, now_s: float) -> Ending | None:
         """The loop was held up: brake first, and look again in the next tick with samples that arrived since.

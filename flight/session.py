@@ -9,8 +9,8 @@ from __future__ import annotations
 import logging
 import math
 import time
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,9 @@ from flight.preflight import (
     require,
 )
 from flight.px4 import FlightMode, mode_name
+from flight.px4_log import fetch_px4_log
 from flight.realtime import real_time
+from flight.recording_setup import FlightRecording, flight_header, record_flight
 from flight.report import write_report
 from flight.results import judge_flight, true_distance_m, truth_from_report
 from flight.scan_log import write_scans
@@ -90,6 +92,7 @@ class FlightSession:
         self._events: list[str] = []
         self._gateway: GatewayProcess | None = None
         self._ready: GatewayReady | None = None
+        self._recording = FlightRecording(None)
 
     def run(self) -> FlightResult:
         """The whole flight. Raises `FlyError` (nothing armed) or `Interrupted` (stopped before arming)."""
@@ -105,9 +108,14 @@ class FlightSession:
             lidar.follow(lambda: body_motion(link.state(frame)))
             level = self._mission.lidar.tilt_compensation
             pilot = Pilot(policy, SafetyFilter(self._mission.safety), place.goal, self._mission.goal.radius_m, level_scans=level)
-            flight = OffboardFlight(link, lidar, pilot, frame, self._mission, self._interrupt, self._status)
+            self._recording = stack.enter_context(self._record(policy, place, frame))
+            recorder = self._recording.recorder
+            flight = OffboardFlight(link, lidar, pilot, frame, self._mission, self._interrupt, self._status, recorder=recorder)
             with real_time(self._mission.realtime, self._status.phase):
                 ending, landed = self._fly(link, flight, frame)
+            recorder.event(f"{ending.outcome}: {ending.message}; {'landed' if landed else 'not landed'}")
+            if self._mission.recording.px4_log:
+                self._status.phase(fetch_px4_log(link.system, self._folder, self._interrupt))
             link.close()
             stack.close()  # the gateway writes its report when it ends
         return self._results(flight, policy, place, ending, landed)
@@ -229,6 +237,11 @@ class FlightSession:
         mean = NedVector(*(float(np.mean([getattr(p, axis) for p in positions])) for axis in "xyz"))
         return CorridorFrame.anchored(mean, CorridorVector(*place.takeoff_point, 0.0), heading)
 
+    def _record(self, policy: PolicyRunner, place: Place, frame: CorridorFrame) -> AbstractContextManager[FlightRecording]:
+        boxes = self._ready.boxes if self._ready is not None else None
+        header = flight_header(self._mission, policy, place.goal, frame, boxes)
+        return record_flight(self._mission, self._folder, header, self._status.phase)
+
     # -- armed --------------------------------------------------------------------------------------------------
 
     def _fly(self, link: VehicleLink, flight: OffboardFlight, frame: CorridorFrame) -> tuple[Ending, bool]:
@@ -274,6 +287,7 @@ class FlightSession:
         """Climb with PX4's own takeoff until height and speed are steady. An ending when that is not to be."""
         mission, height_m = self._mission, self._mission.takeoff_height_m
         self._status.phase(f"taking off to {height_m:g} m")
+        self._recording.recorder.event(f"taking off to {height_m:g} m")
         link.take_off(height_m)
         deadline = time.monotonic() + mission.timeouts.takeoff_s
         steady_since, left_ground = math.nan, False
@@ -309,6 +323,7 @@ class FlightSession:
         self._status.phase("height reached; switching to OFFBOARD")
         flight.engage()
         self._status.phase("the policy flies (Ctrl-C: brake, hold, land)")
+        self._recording.recorder.event("the policy flies")
         return flight.run()
 
     def _pause(self, seconds: float) -> None:
@@ -348,6 +363,7 @@ class FlightSession:
                 "goal_radius_m": self._mission.goal.radius_m,
                 "fence_m": {"min": self._mission.safety.fence.min_m, "max": self._mission.safety.fence.max_m},
                 "true_distance_to_goal_m": true_distance_m(report, place.goal),
+                "recording": asdict(recorded) if (recorded := self._recording.summary) is not None else None,
             },
         )
         write_json_atomic(self._folder / "summary.json", summary)

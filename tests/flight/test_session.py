@@ -20,6 +20,9 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from stand import Program, Stand
 
+from flight.recording_reader import read_recording
+from flight.replay import compare
+
 pytestmark = pytest.mark.realtime
 
 FLYING = "the policy flies"
@@ -133,6 +136,17 @@ def test_writes_the_run_folder(flown: Flown) -> None:
     stalled = len([event for event in stand.summary()["failsafe_events"] if "stalled" in event])
     assert len(rows) == stand.summary()["loop"]["ticks"] - stalled
     assert float(rows[-1]["x_m"]) == pytest.approx(4.5, abs=0.6)
+
+
+def test_the_recording_replays_bit_for_bit(flown: Flown) -> None:
+    stand, _, _ = result(flown, to_the_goal)
+    recording = read_recording(stand.folder / "run" / "flight.mcap")
+    compared = compare(recording)
+    assert compared.identical, compared.first
+    summary = stand.summary()
+    assert compared.ticks == summary["recording"]["ticks"] == summary["loop"]["ticks"]
+    assert summary["recording"]["dropped"] == 0
+    assert "goal_reached" in recording.events[-1][1]
 
 
 def test_ctrl_c_brakes_holds_and_lands_however_often_it_is_pressed(flown: Flown) -> None:
