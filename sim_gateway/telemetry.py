@@ -105,7 +105,10 @@ def _clamp_int(value: float, low: int, high: int) -> int:
 
 
 class Telemetry:
-    """Builds messages for the vehicle's present state. `snapshot` is called once per message, `now_s` gives vehicle time."""
+    """Builds messages for the vehicle's present state. `snapshot` is called once per message, `now_s` gives vehicle time.
+
+    Fault switches: messages named in `silent` are not streamed, and `alter[name]` may change a message before it is sent.
+    """
 
     def __init__(
         self, autopilot: Autopilot, frame: LocalFrame, snapshot: Callable[[], Snapshot], now_s: Callable[[], float]
@@ -115,6 +118,8 @@ class Telemetry:
         self._frame = frame
         self._snapshot = snapshot
         self._sequence = 0
+        self.silent: set[str] = set()
+        self.alter: dict[str, Callable[[Message], None]] = {}
         self._builders: dict[str, Callable[[Snapshot], Message]] = {
             name: getattr(self, f"_{name.lower()}") for name in (*STREAM_RATES_HZ, "AUTOPILOT_VERSION")
         }
@@ -126,11 +131,14 @@ class Telemetry:
 
     def available(self, name: str) -> bool:
         """Whether start-up has come far enough for this message."""
-        return self.now_s() >= _FROM_S.get(name, LOCAL_FROM_S)
+        return name not in self.silent and self.now_s() >= _FROM_S.get(name, LOCAL_FROM_S)
 
     def build(self, name: str) -> Message:
         """The message now; raises KeyError for a name outside the tables."""
-        return self._builders[name](self._snapshot())
+        message = self._builders[name](self._snapshot())
+        if name in self.alter:
+            self.alter[name](message)
+        return message
 
     # ---- identity and status
 
