@@ -43,7 +43,7 @@ class Landing:
             self._status.phase("landing")
             accepted = self._command(FlightMode.LAND, LAND_TRIES, None)
         except ControlLostError as error:
-            return self._link.telemetry.armed is False or self._yield(str(error))
+            return not self._link.armed or self._yield(str(error))
         if not accepted:
             self.events.append("the vehicle did not accept the landing: take over and land by hand")
             self._status.phase(self.events[-1])

@@ -111,9 +111,7 @@ class TetherSection(_Section):
     max_vertical_speed_m_s: float = Field(default=0.3, gt=0.05, le=2.0)
     max_yaw_rate_rad_s: float = Field(default=0.5, gt=0.05, le=3.0)
     max_height_m: float = Field(default=2.0, ge=0.5, le=50.0, description="top of the fence, corridor z")
-    max_distance_m: float = Field(
-        default=3.0, ge=0.5, le=100.0, description="of the fence's sides from the takeoff point, in x and y"
-    )
+    max_distance_m: float = Field(default=3.0, ge=0.5, le=100.0, description="from the takeoff point to the fence")
     max_flight_s: Seconds = Field(default=60.0, description="from OFFBOARD to the landing")
 
 
