@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import typer
 
 from flight.checks.computer import check_computer
 from flight.checks.facts import Value, VehicleFacts
@@ -49,9 +50,7 @@ from policy_export.runner import PolicyRunner
 from safety.frames import CorridorFrame
 from safety.messages import LidarScan
 
-LISTEN_S = 2.0
-REST_SAMPLES, REST_PERIOD_S = 20, 0.1
-SCANS_KEPT = 10
+REST_PERIOD_S = 0.1
 INFERENCE_STEPS, SLOW_INFERENCE_MS = 40, 15.0
 
 
@@ -70,13 +69,13 @@ def run_check(
             status.checks(checks)
             status.phase(_verdict(checks))
     except Interrupted:
-        print("fly check: stopped, nothing was armed", file=sys.stderr)
+        typer.echo("fly check: stopped, nothing was armed", err=True)
         return int(ExitCode.NOT_REACHED)
     except FlyError as error:
-        print(f"fly check: {error}", file=sys.stderr)
+        typer.echo(f"fly check: {error}", err=True)
         return int(error.exit_code)
     if as_json:
-        print(json.dumps(as_document(checks, checkup.applied)))
+        typer.echo(json.dumps(as_document(checks, checkup.applied)))
     return int(ExitCode.REFUSED if _failed(checks) else ExitCode.GOAL_REACHED)
 
 
@@ -107,20 +106,39 @@ def _verdict(checks: Sequence[Check]) -> str:
     return f"ready as far as can be seen without arming, {warned} warning(s)"
 
 
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How long to look. `listen_s`: at the vehicle before it is judged; `settle_s`: at most, for its estimate to start."""
+
+    listen_s: float = 2.0
+    settle_s: float = 10.0
+    rest_samples: int = 20
+    scans: int = 10
+
+
 class Checkup:
     """One run of all checks. What is not there becomes a failed line, and what hangs on it is left out."""
 
     def __init__(
-        self, mission: Mission, status: Status, interrupt: Interrupt, *, apply: bool, motion: bool, tether: bool
+        self,
+        mission: Mission,
+        status: Status,
+        interrupt: Interrupt,
+        *,
+        apply: bool = False,
+        motion: bool = False,
+        tether: bool = False,
+        pace: Pace | None = None,
     ) -> None:
         self.applied: dict[str, Value] = {}
         self._mission, self._status, self._interrupt = mission, status, interrupt
         self._apply, self._motion, self._tether = apply, motion, tether
+        self._pace = pace or Pace()
         self._policy: PolicyRunner | None = None
 
     def run(self) -> list[Check]:
         """All lines. Raises `MissionError` or `GatewayError` where nothing can be checked at all."""
-        checks = self._check_policy()
+        checks = self.check_policy_file()
         with ExitStack() as stack:
             ready = self._start_gateway(stack)
             place, problems = self._place(ready)
@@ -131,15 +149,18 @@ class Checkup:
             if facts is None:
                 checks.append(Check("link", Level.FAIL, f"no vehicle on {link.url}", "check power, cable, vehicle.connection"))
             else:
-                checks += self._check_vehicle(link, facts, place)
-            checks += self._check_lidar(lidar)
+                checks += self.check_vehicle(link, facts, place)
+            checks += self.check_lidar(lidar)
             if self._motion and facts is not None and place is not None:
                 checks += self._move_by_hand(link, lidar, place)
+            elif not self._mission.simulated:
+                checks.append(_orientation_untested())
         return checks + check_computer(_vehicle_clock_s(facts), Path.cwd())
 
     # -- without a vehicle --------------------------------------------------------------------------------------
 
-    def _check_policy(self) -> list[Check]:
+    def check_policy_file(self) -> list[Check]:
+        """The policy file itself: readable, the one that was meant, within the limits, quick enough here."""
         section = self._mission.policy
         try:
             policy = PolicyRunner.load(section.path, rate_hz=LOOP_RATE_HZ, expected_sha256=section.sha256)
@@ -198,7 +219,8 @@ class Checkup:
             self._status.phase(str(error))
             return None
 
-    def _check_vehicle(self, link: VehicleLink, facts: VehicleFacts, place: Place | None) -> list[Check]:
+    def check_vehicle(self, link: VehicleLink, facts: VehicleFacts, place: Place | None) -> list[Check]:
+        """All that the vehicle says and holds. `place` None leaves out what needs the mission's geometry."""
         mission, telemetry = self._mission, link.telemetry
         try:
             link.request_stream_rates(mission.vehicle.stream_rate_hz)
@@ -225,15 +247,15 @@ class Checkup:
         def settled() -> bool:
             status, estimator = facts.newest("SYS_STATUS"), facts.newest("ESTIMATOR_STATUS")
             told = status is not None and estimator is not None and link.telemetry.imu is not None
-            return told and time.monotonic() - before_s > LISTEN_S and _all_healthy(status)
+            return told and time.monotonic() - before_s > self._pace.listen_s and _all_healthy(status)
 
-        link.wait_until(settled, min(self._mission.timeouts.ready_s, 10.0), self._interrupt.check)
+        link.wait_until(settled, min(self._mission.timeouts.ready_s, self._pace.settle_s), self._interrupt.check)
 
     def _rest(self, link: VehicleLink) -> tuple[VehicleFacts, list[LocalPosition]]:
-        """Two seconds of a standing vehicle: facts with fresh rates, and its position samples."""
+        """A while of a standing vehicle: facts with fresh rates, and its position samples."""
         facts = VehicleFacts(link)
         found: list[LocalPosition] = []
-        for _ in range(REST_SAMPLES):
+        for _ in range(self._pace.rest_samples):
             self._interrupt.check()
             if link.telemetry.position is not None:
                 found.append(link.telemetry.position)
@@ -274,10 +296,11 @@ class Checkup:
 
     # -- LiDAR --------------------------------------------------------------------------------------------------
 
-    def _check_lidar(self, lidar: ScipDriver) -> list[Check]:
+    def check_lidar(self, lidar: ScipDriver) -> list[Check]:
+        """A few scans of a standing vehicle."""
         scans: list[LidarScan] = []
         deadline = time.monotonic() + self._mission.timeouts.lidar_s
-        while len(scans) < SCANS_KEPT and time.monotonic() < deadline:
+        while len(scans) < self._pace.scans and time.monotonic() < deadline:
             self._interrupt.check()
             scan = lidar.wait_for_scan(0.2)
             if scan is not None:
@@ -293,6 +316,11 @@ class Checkup:
         frame = anchor_frame(link, self._mission, place, self._interrupt.check)
         prompt = lambda text: self._status.phase(f"by hand: {text}")  # noqa: E731
         return HandTest(lidar.latest, lambda: link.state(frame), prompt, self._interrupt.check).run(frame)
+
+
+def _orientation_untested() -> Check:
+    advice = "run fly check --motion once after every change of mounting: it shows a turned or mirrored LiDAR"
+    return Check("LiDAR orientation", Level.WARN, "not tested", advice)
 
 
 def _check_inference(policy: PolicyRunner) -> Check:

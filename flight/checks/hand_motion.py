@@ -100,9 +100,11 @@ class HandTest:
         prompt: Callable[[str], None],
         keep_waiting: Callable[[], None],
         clock: Callable[[], float] = time.monotonic,
+        deadline_s: float = STEP_DEADLINE_S,
     ) -> None:
         self.samples: list[Sample] = []
         self._scan, self._state, self._prompt, self._keep_waiting, self._clock = scan, state, prompt, keep_waiting, clock
+        self._deadline_s = deadline_s
 
     def run(self, frame: CorridorFrame) -> list[Check]:
         """All steps in turn; the first that is not made ends it."""
@@ -110,7 +112,7 @@ class HandTest:
         for step in STEPS:
             ends = self._make(step)
             if ends is None:
-                seen = f"not done within {STEP_DEADLINE_S:g} s, or the odometry did not follow"
+                seen = f"not done within {self._deadline_s:g} s, or the odometry did not follow"
                 checks.append(
                     Check(f"axes: {step.name}", Level.FAIL, seen, "repeat it; if the vehicle did move, check its position source")
                 )
@@ -120,7 +122,7 @@ class HandTest:
 
     def _make(self, step: HandStep) -> tuple[VehicleState, VehicleState] | None:
         self._prompt(step.prompt)
-        first, deadline = self._state(), self._clock() + STEP_DEADLINE_S
+        first, deadline = self._state(), self._clock() + self._deadline_s
         while self._clock() < deadline:
             self._keep_waiting()
             now = self._state()
