@@ -41,13 +41,17 @@ def fly(
         bool, typer.Option("--json", help="Print summary.json on stdout; everything else goes to stderr.")
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before arming a real vehicle.")] = False,
+    shadow: Annotated[
+        bool, typer.Option("--shadow", help="The pilot flies; policy and safety are logged, nothing is sent.")
+    ] = False,
+    tether: Annotated[bool, typer.Option("--tether", help="First flights: the mission's reduced limits.")] = False,
 ) -> None:
     """Check, arm, take off, fly the policy to the goal in OFFBOARD, land, and write one folder of results."""
     if context.invoked_subcommand is None:
         if mission is None:
             raise MissionError("what is to be flown? Give a mission with --mission; see fly --help")
-        raise typer.Exit(_fly(mission, out, seed, as_json, yes))
-    if mission is not None or out is not None or seed is not None or as_json or yes:
+        raise typer.Exit(_fly(mission, out, seed, as_json, yes, shadow=shadow, tether=tether))
+    if mission is not None or out is not None or seed is not None or as_json or yes or shadow or tether:
         raise MissionError(f"options of `fly {context.invoked_subcommand}` come after its name; see its --help")
 
 
@@ -55,12 +59,16 @@ def fly(
 def check(
     mission: Annotated[Path, typer.Option(help="Mission file (YAML), see docs/mission.md.")],
     apply: Annotated[bool, typer.Option("--apply", help="Also set the parameters that are wrong, and upload the fence.")] = False,
+    motion: Annotated[
+        bool, typer.Option("--motion", help="Also move and turn the vehicle by hand, to compare the axes.")
+    ] = False,
+    tether: Annotated[bool, typer.Option("--tether", help="Check against the mission's reduced limits.")] = False,
     as_json: Json = False,
 ) -> None:
     """Check everything that can be checked without arming, and say what to do about it."""
     from flight.check_command import run_check
 
-    raise typer.Exit(run_check(mission, apply, as_json))
+    raise typer.Exit(run_check(mission, apply, as_json, motion=motion, tether=tether))
 
 
 @app.command(epilog="Example:\n\nfly report runs/seed17")
@@ -97,7 +105,7 @@ def replay(
     raise typer.Exit(run_replay(file, policy, tolerance, as_json))
 
 
-def _fly(mission_path: Path, out: Path | None, seed: int | None, as_json: bool, yes: bool) -> int:
+def _fly(mission_path: Path, out: Path | None, seed: int | None, as_json: bool, yes: bool, *, shadow: bool, tether: bool) -> int:
     from flight.interrupt import Interrupt, Interrupted
     from flight.mission import load_mission
     from flight.results import make_run_folder, remove_if_empty
@@ -105,12 +113,12 @@ def _fly(mission_path: Path, out: Path | None, seed: int | None, as_json: bool, 
     from flight.status import Status
 
     mission = load_mission(mission_path, seed)
-    if not mission.simulated:
+    if not mission.simulated and not shadow:
         _confirm(mission.vehicle.connection, yes)
     folder = make_run_folder(out, mission.name)
     with Status(machine_output=as_json) as status, Interrupt(lambda name: status.phase(f"{name}: stopping")) as interrupt:
         try:
-            result = FlightSession(mission, folder, status, interrupt).run()
+            result = FlightSession(mission, folder, status, interrupt, shadow=shadow, tether=tether).run()
         except Interrupted:
             print(f"fly: stopped by {interrupt.name} before arming", file=sys.stderr)
             return ExitCode.NOT_REACHED

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from flight.authority import ControlLostError
 from flight.errors import VehicleCommandError
 from flight.interrupt import Interrupt
 from flight.link import VehicleLink
@@ -37,25 +38,28 @@ class Landing:
         """Hold, then land. `keep_alive` keeps the setpoint stream up until PX4 has left OFFBOARD."""
         if self._link.telemetry.armed is False:
             return True
-        own_mode = self._link.mode
-        if self._command(FlightMode.HOLD, 1, keep_alive):
-            own_mode = FlightMode.HOLD
-        if self._link.mode not in (own_mode, FlightMode.LAND):
-            return self._yield()
-        self._status.phase("landing")
-        if not self._command(FlightMode.LAND, LAND_TRIES, None):
+        try:
+            self._command(FlightMode.HOLD, 1, keep_alive)
+            self._status.phase("landing")
+            accepted = self._command(FlightMode.LAND, LAND_TRIES, None)
+        except ControlLostError as error:
+            return not self._link.armed or self._yield(str(error))
+        if not accepted:
             self.events.append("the vehicle did not accept the landing: take over and land by hand")
             self._status.phase(self.events[-1])
             return False
         return self._wait_for_disarm()
 
     def _command(self, mode: FlightMode, tries: int, keep_alive: Callable[[], None] | None) -> bool:
+        """Whether PX4 took the mode. Raises `ControlLostError`: nothing more may be commanded."""
         for _ in range(tries):
-            if self._link.mode == mode:
+            if self._link.in_control and self._link.mode == mode:
                 return True
             try:
                 self._link.set_mode(mode, keep_alive)
                 return True
+            except ControlLostError:
+                raise
             except (VehicleCommandError, RuntimeError) as error:
                 self.events.append(str(error))
         return False
@@ -76,13 +80,13 @@ class Landing:
             elif foreign_since is None:
                 foreign_since = self._clock()
             elif self._clock() - foreign_since > FOREIGN_MODE_S:
-                return self._yield()
+                return self._yield(f"mode {mode_name(self._link.mode)} was not commanded by fly")
             time.sleep(0.02)
         self.events.append(f"not disarmed {self._land_timeout_s:g} s after the landing command: check the vehicle")
         self._status.phase(self.events[-1])
         return False
 
-    def _yield(self) -> bool:
-        self.events.append(f"mode {mode_name(self._link.mode)} was not commanded by fly: it is the pilot's vehicle now")
+    def _yield(self, why: str) -> bool:
+        self.events.append(f"{why}: it is the pilot's vehicle now")
         self._status.phase(self.events[-1])
         return False

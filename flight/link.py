@@ -20,11 +20,13 @@ from types import TracebackType
 from typing import Any
 from urllib.parse import urlsplit
 
+from flight.authority import Authority
 from flight.errors import MissionError, NoVehicleError, RefusedError, VehicleCommandError
 from flight.px4 import (
     AUTOPILOT_COMPONENT,
     AUTOPILOT_PX4,
     COMMAND_DO_SET_MODE,
+    COMMAND_REQUEST_MESSAGE,
     COMMAND_SET_MESSAGE_INTERVAL,
     FRAME_LOCAL_NED,
     MESSAGE_ID,
@@ -55,6 +57,9 @@ class VehicleLink:
     `url` is MAVSDK's (`udpin://127.0.0.1:14540`, `udpout://...`, `tcpout://...`, `serial:///dev/ttyAMA0:921600`).
     Every command has a deadline and raises `VehicleCommandError` with the vehicle's own words. `keep_alive`, where a
     method takes it, is called at least every 20 ms while waiting, so that a setpoint stream can go on meanwhile.
+
+    With an `authority`, the link itself is the last gate of "pilot first": once control is lost, every setpoint, mode command,
+    arming and takeoff raises `ControlLostError` before anything is sent.
     """
 
     def __init__(self, url: str, clock: Callable[[], float] = time.monotonic) -> None:
@@ -63,6 +68,7 @@ class VehicleLink:
         self.system: Any = None
         self.system_id = 0
         self.setpoints_sent = 0
+        self.authority: Authority | None = None
         self._clock = clock
         self._mavsdk: Any = None
         self._direct: Any = None
@@ -143,6 +149,27 @@ class VehicleLink:
         if message.system_id == self.system_id:
             self.telemetry.feed(message.message_name, message.component_id, message.fields_json, self._clock())
 
+    def listen(self, name: str, handler: Callable[[dict[str, Any]], None]) -> None:
+        """Call `handler` with the fields of every message `name` of this vehicle's autopilot, on MAVSDK's thread."""
+
+        def on_message(message: Any, _user_data: Any) -> None:
+            if message.system_id == self.system_id and message.component_id == AUTOPILOT_COMPONENT:
+                try:
+                    handler(json.loads(message.fields_json))
+                except (ValueError, KeyError, TypeError) as error:
+                    log.debug("%s cannot be used: %s", name, error)
+
+        self._direct.subscribe_message(name, on_message)
+
+    def request_message(self, message_id: int) -> None:
+        """Ask for one message, once. Raises `VehicleCommandError` when PX4 does not have it."""
+        self.command_long(COMMAND_REQUEST_MESSAGE, float(message_id), what=f"message {message_id}")
+
+    @property
+    def target(self) -> tuple[int, int]:
+        """System and component id of the autopilot."""
+        return self._target
+
     @property
     def mode(self) -> int | None:
         """The newest mode PX4 reported (`FlightMode` numbering), None before the first."""
@@ -194,8 +221,10 @@ class VehicleLink:
     def send_velocity(self, command: SafeCommand, frame: CorridorFrame) -> float:
         """Send one velocity setpoint; returns the time of the send. The last gate before the wire: not finite is refused.
 
-        Raises `ValueError` on a number that is not finite, `VehicleCommandError` when the link cannot send.
+        Raises `ValueError` on a number that is not finite, `ControlLostError` when the vehicle is not ours any more,
+        `VehicleCommandError` when the link cannot send.
         """
+        self._require_control()
         velocity = frame.vector_to_ned(command.velocity)
         yaw_rate = frame.yaw_rate_to_ned(command.yaw_rate_rad_s)
         if not (math.isfinite(velocity.x + velocity.y + velocity.z) and math.isfinite(yaw_rate)):
@@ -206,15 +235,16 @@ class VehicleLink:
             f'"x":0,"y":0,"z":0,"vx":{velocity.x!r},"vy":{velocity.y!r},"vz":{velocity.z!r},'
             f'"afx":0,"afy":0,"afz":0,"yaw":0,"yaw_rate":{yaw_rate!r}}}'
         )
-        self._send("SET_POSITION_TARGET_LOCAL_NED", fields)
+        self.send_message("SET_POSITION_TARGET_LOCAL_NED", fields)
         self.setpoints_sent += 1
         return self._clock()
 
     def ask_time(self) -> None:
         """Ask the vehicle for its clock (TIMESYNC); the answer keeps `telemetry.clock` honest when the clock stood still."""
-        self._send("TIMESYNC", f'{{"tc1":0,"ts1":{int(self._clock() * 1e9)}}}')
+        self.send_message("TIMESYNC", f'{{"tc1":0,"ts1":{int(self._clock() * 1e9)}}}')
 
-    def _send(self, name: str, fields_json: str) -> None:
+    def send_message(self, name: str, fields_json: str) -> None:
+        """Send one message to the autopilot, once. Raises `VehicleCommandError` when the link cannot send."""
         from mavsdk import MavsdkError  # noqa: PLC0415
 
         try:
@@ -226,6 +256,7 @@ class VehicleLink:
 
     def arm(self, keep_alive: Callable[[], None] | None = None) -> None:
         """Arm, and wait until the heartbeat says so."""
+        self._require_control()
         self._act("arm", "arm", keep_alive)
         if not self.wait_until(lambda: self.armed, 2.5, keep_alive):
             raise VehicleCommandError("the vehicle accepted arming, but its heartbeat does not say armed")
@@ -236,16 +267,41 @@ class VehicleLink:
 
     def take_off(self, height_m: float, keep_alive: Callable[[], None] | None = None) -> None:
         """Set MIS_TAKEOFF_ALT and start PX4's own takeoff; returns when PX4 accepted it, not when the height is reached."""
+        self._require_control()
         self.set_parameter("MIS_TAKEOFF_ALT", float(height_m))
+        if self.authority is not None:
+            self.authority.expect(FlightMode.TAKEOFF)
         self._act("takeoff", "take off", keep_alive)
 
     def set_mode(self, mode: FlightMode, keep_alive: Callable[[], None] | None = None) -> None:
         """Command `mode` and wait until PX4 reports it. PX4's first ack of this command is always `accepted`: not believed."""
+        authority = self.authority
+        if authority is not None:
+            authority.expect(mode)
+        try:
+            self._command_mode(mode, keep_alive)
+        except VehicleCommandError:
+            if authority is not None:
+                authority.require()
+                authority.refused()
+            raise
+        self._require_control()
+
+    def _command_mode(self, mode: FlightMode, keep_alive: Callable[[], None] | None) -> None:
         self.command_long(
             COMMAND_DO_SET_MODE, MODE_FLAG_CUSTOM, mode.main, mode.sub, what=f"mode {mode.name}", keep_alive=keep_alive
         )
-        if not self.wait_until(lambda: self.mode == mode, MODE_DEADLINE_S, keep_alive):
+        if not self.wait_until(lambda: self.mode == mode or not self.in_control, MODE_DEADLINE_S, keep_alive):
             raise VehicleCommandError(f"PX4 did not enter {mode.name}: it stays in {mode_name(self.mode)}{self._last_words()}")
+
+    @property
+    def in_control(self) -> bool:
+        """False once a pilot, PX4 or a restart has taken the vehicle from us."""
+        return self.authority is None or self.authority.lost is None
+
+    def _require_control(self) -> None:
+        if self.authority is not None:
+            self.authority.require()
 
     def command_long(self, command: int, *parameters: float, what: str, keep_alive: Callable[[], None] | None = None) -> None:
         """Send COMMAND_LONG, wait for the final COMMAND_ACK; raises `VehicleCommandError` unless it is accepted."""

@@ -85,6 +85,7 @@ class TimeoutSection(_Section):
     takeoff_s: Seconds = Field(default=40.0, description="to reach the takeoff height")
     flight_s: Seconds = Field(default=180.0, description="from OFFBOARD to the goal")
     stuck_s: Seconds = Field(default=30.0, description="without coming 0.5 m nearer to the goal")
+    pilot_s: Seconds = Field(default=600.0, description="with --shadow: for the pilot to take off")
     land_s: Seconds = Field(default=60.0, description="from the landing command to disarm")
 
 
@@ -104,6 +105,17 @@ class FailsafeSection(_Section):
     def loss_action(self) -> LossAction:
         """Value of COM_OBL_RC_ACT."""
         return LossAction[self.setpoint_loss_action.upper()]
+
+
+class TetherSection(_Section):
+    """Limits of `fly --tether`, for first flights on a line. They only ever reduce the mission's own."""
+
+    max_horizontal_speed_m_s: float = Field(default=0.4, gt=0.05, le=5.0)
+    max_vertical_speed_m_s: float = Field(default=0.3, gt=0.05, le=2.0)
+    max_yaw_rate_rad_s: float = Field(default=0.5, gt=0.05, le=3.0)
+    max_height_m: float = Field(default=2.0, ge=0.5, le=50.0, description="top of the fence, corridor z")
+    max_distance_m: float = Field(default=3.0, ge=0.5, le=100.0, description="from the takeoff point to the fence")
+    max_flight_s: Seconds = Field(default=60.0, description="from OFFBOARD to the landing")
 
 
 class SimSection(_Section):
@@ -143,6 +155,7 @@ class Mission(_Section):
     failsafe: FailsafeSection = FailsafeSection()
     realtime: RealTimeConfig = RealTimeConfig()
     recording: RecordingConfig = RecordingConfig()
+    tether: TetherSection = TetherSection()
     sim: SimSection | None = Field(default=None, validate_default=True)
 
     @property

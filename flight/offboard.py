@@ -15,13 +15,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
+from flight.authority import Authority
 from flight.errors import ExitCode, VehicleCommandError
 from flight.interrupt import Interrupt
 from flight.lidar.driver import LidarDriver
 from flight.link import VehicleLink
 from flight.mission import Mission
 from flight.preflight import LOOP_RATE_HZ
-from flight.px4 import FlightMode, mode_name
+from flight.px4 import FlightMode
 from flight.rate_keeper import RateKeeper
 from flight.recorder import FlightRecorder, NoRecorder
 from flight.status import Status
@@ -79,14 +80,17 @@ class OffboardFlight:
         self._mission, self._interrupt, self._status, self._clock = mission, interrupt, status, clock
         self._sent_s = -math.inf
         self._engaged = False
-        self._mode_changes = 0
         self._loss_certain_s = LOSS_CERTAINTY * mission.failsafe.setpoint_loss_timeout_s
-        self._reboots = link.telemetry.clock.reboots
         self._judge = FlightJudge(mission)
         self._recorder = recorder if recorder is not None else NoRecorder()
 
     def engage(self) -> None:
-        """Stream zero velocity for a second, then command OFFBOARD. Raises `VehicleCommandError` when PX4 refuses."""
+        """Stream zero velocity for a second, then command OFFBOARD.
+
+        Raises `VehicleCommandError` when PX4 refuses, `ControlLostError` when the pilot was quicker.
+        """
+        if self._link.authority is None:
+            self._link.authority = Authority(self._link.telemetry)
         deadline = self._clock() + SETPOINTS_BEFORE_OFFBOARD_S
         self._pilot.tick(self._lidar.latest(), self._link.state(self._frame), self._clock())  # first call allocates
         while self._clock() < deadline:
@@ -94,7 +98,6 @@ class OffboardFlight:
             time.sleep(0.01)
         self._pilot.reset()
         self._link.set_mode(FlightMode.OFFBOARD, keep_alive=self.stay)
-        self._mode_changes = self._link.telemetry.mode_change_count
         self._engaged = True
 
     def stay(self) -> None:
@@ -112,7 +115,7 @@ class OffboardFlight:
         """Fly until there is a reason to end. Raises nothing for what the vehicle or the policy does."""
         self._status.start_live(self._clock())
         try:
-            with _quiet_interpreter():
+            with quiet_interpreter():
                 self.stay()
                 self._align_with_scans()
                 while True:
@@ -191,27 +194,19 @@ class OffboardFlight:
 
     def _lost_control(self, now_s: float) -> Ending | None:
         """Pilot first: a mode that fly did not command ends its control for good, whoever chose it."""
-        telemetry = self._link.telemetry
-        if telemetry.clock.reboots != self._reboots:
-            return Ending("vehicle_rebooted", ExitCode.NOT_REACHED, "the autopilot restarted in flight: control given up", False)
-        if telemetry.armed is False:
-            return Ending("disarmed", ExitCode.NOT_REACHED, "the vehicle was disarmed in flight: control given up", False)
-        changed = telemetry.mode_change_count != self._mode_changes  # also when it is OFFBOARD again by now
-        if changed or telemetry.mode != FlightMode.OFFBOARD:
-            name = mode_name(next((mode for _, mode in reversed(telemetry.mode_changes) if mode != FlightMode.OFFBOARD), None))
-            return Ending(
-                "pilot_took_over", ExitCode.NOT_REACHED, f"mode {name} was not commanded by fly: control given up", False
-            )
+        authority, telemetry = self._link.authority, self._link.telemetry
+        if authority is not None and (reason := authority.lost) is not None:
+            return Ending(authority.outcome, ExitCode.NOT_REACHED, reason, in_control=False)
         if now_s - telemetry.heartbeat_s > LINK_LOST_S:
             message = f"no heartbeat from the vehicle for {LINK_LOST_S:g} s: the stream stops, PX4's own failsafe flies"
-            return Ending("link_lost", ExitCode.SAFETY_ENDED, message)
+            return Ending("link_lost", ExitCode.SAFETY_ENDED, message, in_control=False)  # blind: a pilot may have it
         return None
 
     def brake(self, duration_s: float) -> None:
         """Zero velocity for `duration_s` while OFFBOARD lasts. Never raises."""
         deadline = self._clock() + duration_s
         try:
-            while self._clock() < deadline and self._link.mode == FlightMode.OFFBOARD:
+            while self._clock() < deadline and self._link.in_control and self._link.mode == FlightMode.OFFBOARD:
                 self.stay()
                 time.sleep(0.01)
         except VehicleCommandError as error:
@@ -257,7 +252,7 @@ class FlightJudge:
 
 
 @contextmanager
-def _quiet_interpreter() -> Iterator[None]:
+def quiet_interpreter() -> Iterator[None]:
     """No garbage collection in the loop (a full one takes 10 to 100 ms), and quick hand-over between threads."""
     interval = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)

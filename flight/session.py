@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from flight.authority import Authority, ControlLostError
 from flight.errors import ExitCode, MissionError, RefusedError, VehicleCommandError
 from flight.gateway_process import GatewayProcess, GatewayReady
 from flight.interrupt import Interrupt
@@ -23,7 +24,7 @@ from flight.landing import Landing
 from flight.lidar import LidarDriver, body_motion, open_lidar
 from flight.lidar.from_link import feed_from_link
 from flight.link import VehicleLink, check_port_is_free
-from flight.mission import Mission, goal_problem, takeoff_point_problem
+from flight.mission import Mission
 from flight.offboard import Ending, OffboardFlight
 from flight.preflight import (
     LOOP_RATE_HZ,
@@ -36,41 +37,41 @@ from flight.preflight import (
     check_vehicle,
     require,
 )
-from flight.px4 import FlightMode, mode_name
+from flight.preparation import (
+    ANCHOR_SAMPLES,
+    Place,
+    anchor_frame,
+    gateway_arguments,
+    lidar_source,
+    resolve_place,
+    vehicle_url,
+)
+from flight.px4 import FlightMode
 from flight.px4_log import fetch_px4_log
 from flight.realtime import real_time
 from flight.recording_setup import FlightRecording, flight_header, record_flight
 from flight.report import write_report
 from flight.results import judge_flight, true_distance_m, truth_from_report
 from flight.scan_log import write_scans
+from flight.shadow import ShadowFlight
 from flight.status import Status
 from flight.summary import build_summary, write_json_atomic
+from flight.tether import tethered
 from flight.tick import Pilot
 from flight.trajectory import draw_trajectory_png, write_timing_csv, write_trajectory_csv
 from policy_export.errors import PolicyError
 from policy_export.runner import PolicyRunner
 from safety.filter import SafetyFilter
-from safety.frames import CorridorFrame, CorridorVector, NedVector
+from safety.frames import CorridorFrame
 
 log = logging.getLogger("flight.session")
 
-ANCHOR_SAMPLES = 25
-ANCHOR_PERIOD_S = 0.04
 HEIGHT_TOLERANCE_M = 0.5
 STILL_SPEED_M_S = 0.25
 STILL_FOR_S = 1.0
 BRAKE_S = 1.0
 ARM_RETRY_S = 0.5
-TAKEOFF_MODES = (FlightMode.TAKEOFF, FlightMode.HOLD)
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Mission geometry with every `world` filled in. Corridor frame, m."""
-
-    takeoff_point: tuple[float, float]
-    start_yaw_rad: float
-    goal: CorridorVector
+TAKEOFF_ENDS_WITHIN_M = 1.0  # PX4's default NAV_MC_ALT_RAD, 0.8 m, and the error of the estimate
 
 
 @dataclass(slots=True)
@@ -87,9 +88,21 @@ class FlightResult:
 class FlightSession:
     """Runs one mission once. `run` raises `FlyError` for everything that ends before arming."""
 
-    def __init__(self, mission: Mission, folder: Path, status: Status, interrupt: Interrupt) -> None:
+    def __init__(
+        self,
+        mission: Mission,
+        folder: Path,
+        status: Status,
+        interrupt: Interrupt,
+        *,
+        shadow: bool = False,
+        tether: bool = False,
+    ) -> None:
+        """`shadow`: the pilot flies, nothing is sent. `tether`: the mission's reduced limits for first flights."""
         self._mission, self._folder, self._status, self._interrupt = mission, folder, status, interrupt
+        self._shadow, self._tether = shadow, tether
         self._events: list[str] = []
+        self._setpoints_sent = 0
         self._gateway: GatewayProcess | None = None
         self._ready: GatewayReady | None = None
         self._recording = FlightRecording(None)
@@ -100,8 +113,8 @@ class FlightSession:
         with ExitStack() as stack:
             self._start_gateway(stack)
             place = self._place()
-            lidar = stack.enter_context(open_lidar(self._lidar_source()))
-            link = stack.enter_context(VehicleLink(self._url()))
+            lidar = stack.enter_context(open_lidar(lidar_source(self._mission)))
+            link = stack.enter_context(VehicleLink(vehicle_url(self._mission)))
             self._connect(link, lidar)
             self._preflight(link, lidar, policy, place)
             frame = self._anchor(link, place)
@@ -109,16 +122,29 @@ class FlightSession:
             level = self._mission.lidar.tilt_compensation
             pilot = Pilot(policy, SafetyFilter(self._mission.safety), place.goal, self._mission.goal.radius_m, level_scans=level)
             self._recording = stack.enter_context(self._record(policy, place, frame))
-            recorder = self._recording.recorder
-            flight = OffboardFlight(link, lidar, pilot, frame, self._mission, self._interrupt, self._status, recorder=recorder)
             with real_time(self._mission.realtime, self._status.phase):
-                ending, landed = self._fly(link, flight, frame)
-            recorder.event(f"{ending.outcome}: {ending.message}; {'landed' if landed else 'not landed'}")
+                flight, ending, landed = self._follow_or_fly(link, lidar, pilot, frame)
+            self._setpoints_sent = link.setpoints_sent
+            self._recording.recorder.event(f"{ending.outcome}: {ending.message}; {'landed' if landed else 'not landed'}")
             if self._mission.recording.px4_log:
                 self._status.phase(fetch_px4_log(link.system, self._folder, self._interrupt))
             link.close()
             stack.close()  # the gateway writes its report when it ends
         return self._results(flight, policy, place, ending, landed)
+
+    def _follow_or_fly(
+        self, link: VehicleLink, lidar: LidarDriver, pilot: Pilot, frame: CorridorFrame
+    ) -> tuple[OffboardFlight | ShadowFlight, Ending, bool]:
+        """The flight itself: flown by the policy, or with `shadow` by the pilot; its ending, and whether the vehicle landed."""
+        parts = (link, lidar, pilot, frame, self._mission, self._interrupt, self._status)
+        recorder = self._recording.recorder
+        if self._shadow:
+            shadow = ShadowFlight(*parts, recorder=recorder)
+            ending, landed = shadow.watch()
+            self._events += shadow.events
+            return shadow, ending, landed
+        flight = OffboardFlight(*parts, recorder=recorder)
+        return flight, *self._fly(link, flight, frame)
 
     # -- before arming ------------------------------------------------------------------------------------------
 
@@ -133,47 +159,23 @@ class FlightSession:
         mission, sim = self._mission, self._mission.sim
         if not mission.simulated or sim is None:
             return
-        check_port_is_free(self._url())
-        arguments = ["--world", str(sim.world), "--seed", str(sim.seed), "--dynamics", sim.dynamics, "--estimate", sim.estimate]
-        arguments += ["--onboard-port", str(sim.onboard_port), "--gcs-port", str(sim.gcs_port)]
-        arguments += ["--lidar-port", str(mission.lidar.port), "--wind=" + ",".join(map(repr, sim.wind_m_s))]
-        if mission.frame.takeoff_point_m != "world":
-            arguments.append("--start=" + ",".join(map(repr, mission.frame.takeoff_point_m)))
-        if mission.goal.position_m != "world":
-            arguments.append("--goal=" + ",".join(map(repr, mission.goal.position_m)))
-        if mission.frame.heading_deg != "vehicle":
-            arguments.append(f"--heading={mission.frame.heading_deg!r}")
+        check_port_is_free(vehicle_url(mission))
         self._status.phase(f"starting the simulator: {sim.world.name}, seed {sim.seed} (the first start compiles for a minute)")
-        self._gateway = stack.enter_context(GatewayProcess(arguments, self._folder / "gateway.json"))
+        self._gateway = stack.enter_context(GatewayProcess(gateway_arguments(mission), self._folder / "gateway.json"))
         self._ready = self._gateway.start(mission.timeouts.gateway_s, self._interrupt.check)
 
     def _place(self) -> Place:
-        """Takeoff point and goal as numbers; what the world filled in is checked like what the file said."""
+        """Takeoff point and goal as numbers, checked; with `tether` the mission is reduced around them."""
         mission, ready = self._mission, self._ready
-        takeoff, goal = mission.frame.takeoff_point_m, mission.goal.position_m
+        place = resolve_place(mission, ready)
+        if self._tether:
+            self._mission, place, notes = tethered(mission, place)
+            for note in notes:
+                self._status.phase(f"tether: {note}")
         if ready is not None:
-            takeoff = ready.start[:2] if takeoff == "world" else takeoff
-            goal = ready.goal if goal == "world" else goal
-        if takeoff == "world" or goal == "world":
-            raise MissionError("`world` positions need vehicle.connection: sim; give numbers")
-        place = Place(takeoff, ready.start_yaw_rad if ready is not None else 0.0, CorridorVector(*goal))
-        for problem in (
-            goal_problem(place.goal, mission.safety),
-            takeoff_point_problem(takeoff, mission.safety),
-        ):
-            if problem is not None:
-                raise RefusedError(f"this world does not fit the mission: {problem}")
-        if ready is not None:
-            require(check_start(takeoff, mission.takeoff_height_m, ready.boxes, mission.safety))
-            require(check_goal_clear(place.goal, ready.boxes, mission.safety))
+            require(check_start(place.takeoff_point, self._mission.takeoff_height_m, ready.boxes, self._mission.safety))
+            require(check_goal_clear(place.goal, ready.boxes, self._mission.safety))
         return place
-
-    def _url(self) -> str:
-        sim = self._mission.sim
-        return f"udpin://127.0.0.1:{sim.onboard_port}" if self._mission.simulated and sim else self._mission.vehicle.connection
-
-    def _lidar_source(self) -> Any:
-        return self._mission.lidar.model_copy(update={"host": "127.0.0.1"}) if self._mission.simulated else self._mission.lidar
 
     def _connect(self, link: VehicleLink, lidar: LidarDriver) -> None:
         timeouts, source = self._mission.timeouts, self._mission.lidar
@@ -203,7 +205,7 @@ class FlightSession:
         if self._ready is not None:
             checks += check_start(place.takeoff_point, mission.takeoff_height_m, self._ready.boxes, mission.safety)
             checks += check_goal_clear(place.goal, self._ready.boxes, mission.safety)
-        if all(check.level is not Level.FAIL for check in checks):
+        if not self._shadow and all(check.level is not Level.FAIL for check in checks):
             checks.append(self._set_loss_action(link))
         self._status.checks(checks)
         require(checks)
@@ -220,22 +222,8 @@ class FlightSession:
         return Check("setpoint loss", Level.PASS, seen)
 
     def _anchor(self, link: VehicleLink, place: Place) -> CorridorFrame:
-        """The corridor frame through the spot where the vehicle stands, from the mean of a second of samples."""
-        positions: list[NedVector] = []
-        yaws: list[float] = []
-        for _ in range(ANCHOR_SAMPLES):
-            self._interrupt.check()
-            if link.telemetry.position is not None and link.telemetry.attitude is not None:
-                positions.append(link.telemetry.position.position)
-                yaws.append(link.telemetry.attitude.yaw_rad)
-            time.sleep(ANCHOR_PERIOD_S)
-        if not positions:
-            raise RefusedError("the vehicle stopped telling its position before arming: check the link")
-        yaw = math.atan2(float(np.mean(np.sin(yaws))), float(np.mean(np.cos(yaws))))
-        heading_deg = self._mission.frame.heading_deg
-        heading = yaw + place.start_yaw_rad if heading_deg == "vehicle" else math.radians(heading_deg)
-        mean = NedVector(*(float(np.mean([getattr(p, axis) for p in positions])) for axis in "xyz"))
-        return CorridorFrame.anchored(mean, CorridorVector(*place.takeoff_point, 0.0), heading)
+        """The corridor frame through the spot where the vehicle stands."""
+        return anchor_frame(link, self._mission, place, self._interrupt.check)
 
     def _record(self, policy: PolicyRunner, place: Place, frame: CorridorFrame) -> AbstractContextManager[FlightRecording]:
         boxes = self._ready.boxes if self._ready is not None else None
@@ -246,17 +234,24 @@ class FlightSession:
 
     def _fly(self, link: VehicleLink, flight: OffboardFlight, frame: CorridorFrame) -> tuple[Ending, bool]:
         """Arm to disarm. From arming on, every exception ends in the landing."""
+        link.authority = None
+        if link.mode != FlightMode.HOLD:
+            link.set_mode(FlightMode.HOLD)
+        link.authority = Authority(link.telemetry)
         self._arm(link)
         logging.getLogger("flight").setLevel(logging.WARNING)
         try:
             ending = self._take_off(link, frame) or self._engage_and_run(flight)
+        except ControlLostError as error:
+            ending = Ending(_outcome(link), ExitCode.NOT_REACHED, str(error), in_control=False)
         except VehicleCommandError as error:
             ending = Ending("vehicle_refused", ExitCode.NOT_REACHED, str(error))
         except Exception as error:  # armed: whatever it is, the vehicle must come down
             log.exception("unexpected error in flight")
             ending = Ending("internal_error", ExitCode.SAFETY_ENDED, f"{type(error).__name__}: {error}")
         self._status.phase(ending.message)
-        if not ending.in_control:
+        if not (ending.in_control and link.in_control):
+            self._events += flight.events
             return ending, link.telemetry.armed is False
         if link.mode == FlightMode.OFFBOARD:
             flight.brake(BRAKE_S)
@@ -267,8 +262,6 @@ class FlightSession:
 
     def _arm(self, link: VehicleLink) -> None:
         """Arm from Hold; PX4 refuses while its estimate settles, so ask again until the deadline. Raises `RefusedError`."""
-        if link.mode != FlightMode.HOLD:
-            link.set_mode(FlightMode.HOLD)
         deadline = time.monotonic() + self._mission.timeouts.ready_s
         self._status.phase("arming")
         while True:
@@ -276,6 +269,8 @@ class FlightSession:
             try:
                 link.arm()
                 return
+            except ControlLostError as error:
+                raise RefusedError(f"not armed: {error}") from None
             except VehicleCommandError as error:
                 if link.armed:
                     return
@@ -290,16 +285,19 @@ class FlightSession:
         self._recording.recorder.event(f"taking off to {height_m:g} m")
         link.take_off(height_m)
         deadline = time.monotonic() + mission.timeouts.takeoff_s
-        steady_since, left_ground = math.nan, False
+        steady_since, climbing = math.nan, False
         while time.monotonic() < deadline:
             if self._interrupt.requested:
                 return Ending("stopped", ExitCode.NOT_REACHED, f"stopped by {self._interrupt.name} during takeoff: landing")
-            if link.telemetry.armed is False:
-                return Ending("disarmed", ExitCode.NOT_REACHED, "disarmed during takeoff", in_control=False)
-            left_ground = left_ground or link.mode == FlightMode.TAKEOFF
-            if left_ground and link.mode not in TAKEOFF_MODES:
-                message = f"mode {mode_name(link.mode)} was not commanded by fly: control given up"
+            if not link.in_control:
+                raise ControlLostError(link.authority.lost if link.authority is not None else None)
+            if link.mode == FlightMode.TAKEOFF:
+                climbing = True
+            elif climbing and self._stopped_early(link, frame):
+                message = "Hold during takeoff was not commanded by fly: control given up"
                 return Ending("pilot_took_over", ExitCode.NOT_REACHED, message, in_control=False)
+            else:
+                climbing = False
             steady_since = self._steady_since(link, frame, steady_since)
             if time.monotonic() - steady_since >= STILL_FOR_S:
                 return None
@@ -307,6 +305,11 @@ class FlightSession:
         return Ending(
             "takeoff_timeout", ExitCode.NOT_REACHED, f"height not reached within {mission.timeouts.takeoff_s:g} s: landing"
         )
+
+    def _stopped_early(self, link: VehicleLink, frame: CorridorFrame) -> bool:
+        """Whether Hold came before PX4's own takeoff can have ended: it ends within NAV_MC_ALT_RAD of the height."""
+        state = link.state(frame)
+        return state is not None and state.position.z < self._mission.takeoff_height_m - TAKEOFF_ENDS_WITHIN_M
 
     def _steady_since(self, link: VehicleLink, frame: CorridorFrame, since_s: float) -> float:
         """Since when height and speed have been within tolerance, NaN while they are not."""
@@ -337,7 +340,9 @@ class FlightSession:
 
     # -- results ------------------------------------------------------------------------------------------------
 
-    def _results(self, flight: OffboardFlight, policy: PolicyRunner, place: Place, ending: Ending, landed: bool) -> FlightResult:
+    def _results(
+        self, flight: OffboardFlight | ShadowFlight, policy: PolicyRunner, place: Place, ending: Ending, landed: bool
+    ) -> FlightResult:
         report = self._gateway.report() if self._gateway is not None else {}
         contacts = report.get("contacts")
         exit_code, outcome, message = judge_flight(ending, landed, contacts)
@@ -357,6 +362,9 @@ class FlightSession:
                 "message": message,
                 "exit_code": int(exit_code),
                 "landed": landed,
+                "shadow": self._shadow,
+                "tether": self._tether,
+                "setpoints_sent": self._setpoints_sent,
                 "mission": self._mission.name,
                 "seed": self._mission.sim.seed if self._mission.sim else None,
                 "goal_m": [place.goal.x, place.goal.y, place.goal.z],
@@ -375,7 +383,7 @@ class FlightSession:
         write_report(self._folder)
         return FlightResult(exit_code, outcome, message, self._folder, summary)
 
-    def _draw(self, flight: OffboardFlight, place: Place, report: dict[str, Any], title: str) -> None:
+    def _draw(self, flight: OffboardFlight | ShadowFlight, place: Place, report: dict[str, Any], title: str) -> None:
         boxes = np.array(self._ready.boxes, dtype=np.float64).reshape(-1, 6) if self._ready is not None else None
         draw_trajectory_png(
             self._folder / "trajectory.png",
@@ -387,3 +395,7 @@ class FlightSession:
             truth=truth_from_report(report),
             title=title,
         )
+
+
+def _outcome(link: VehicleLink) -> str:
+    return link.authority.outcome if link.authority is not None else "pilot_took_over"

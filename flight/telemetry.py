@@ -21,6 +21,7 @@ MAX_DRIFT = 0.01
 REBOOT_JUMP_S = 1.0
 SLIP_TOLERANCE_S = 0.02
 MAX_TEXTS = 100
+MAX_MODE_CHANGES = 200
 MAX_ROUND_TRIP_S = 5.0
 
 
@@ -141,8 +142,7 @@ class Telemetry:
         self.autopilot: int | None = None
         self.armed: bool | None = None
         self.mode: int | None = None
-        self.mode_changes: deque[tuple[float, int]] = deque(maxlen=200)
-        self.mode_change_count = 0
+        self.mode_log: tuple[int, tuple[tuple[float, int], ...]] = (0, ())
         self.landed_state: int | None = None
         self.battery_fraction: float | None = None
         self.texts: deque[StatusText] = deque(maxlen=MAX_TEXTS)
@@ -223,8 +223,8 @@ class Telemetry:
     def _set_mode(self, custom_mode: int, arrival_s: float) -> None:
         mode = mode_of(custom_mode)
         if mode != self.mode:
-            self.mode_changes.append((arrival_s, mode))
-            self.mode_change_count += 1
+            count, kept = self.mode_log
+            self.mode_log = (count + 1, (*kept[1 - MAX_MODE_CHANGES :], (arrival_s, mode)))  # one reference: read whole by others
         self.mode = mode
 
     def _on_landed(self, fields: dict[str, object], _arrival_s: float) -> None:

@@ -12,10 +12,20 @@ from collections import deque
 from dataclasses import dataclass
 
 from sim_gateway.flight_modes import AUTO_MAIN_MODE, FlightMode, LandedState, Result, SystemStatus
-from sim_gateway.flight_tasks import FlightTask, HoldTask, LandTask, MotionCommand, OffboardTask, ReturnTask, TakeoffTask
+from sim_gateway.flight_tasks import (
+    FlightTask,
+    HoldTask,
+    LandTask,
+    MotionCommand,
+    OffboardTask,
+    PositionTask,
+    ReturnTask,
+    TakeoffTask,
+)
 from sim_gateway.local_frame import DEFAULT_ALTITUDE_M, NedState, Vector
 from sim_gateway.parameters import ParameterStore
 from sim_gateway.setpoints import OffboardSetpoint
+from sim_gateway.sticks import Sticks, moved
 
 CONTROL_PERIOD_S = 0.02  # PX4's flight tasks run at 50 Hz
 FORCE_MAGIC = 21196  # param 2 of MAV_CMD_COMPONENT_ARM_DISARM: skip the checks
@@ -30,6 +40,10 @@ _RAMP_START_M_S = 0.9  # the takeoff ramp starts as if descending, so that thrus
 _KEPT_TEXTS = 200
 _OBL_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.LOITER}  # COM_OBL_RC_ACT; all others fall back to RTL without a pilot
 _OBL_STOP_MOTORS = (6, 7)
+_OVERRIDE_AUTO, _OVERRIDE_OFFBOARD = 1, 2  # bits of COM_RC_OVERRIDE
+_EXCEPT_HOLD, _EXCEPT_OFFBOARD = 2, 4  # bits of COM_RCL_EXCEPT
+_STICKS_DISABLED, _RADIO_ONLY = 4, 0  # COM_RC_IN_MODE values that ignore MANUAL_CONTROL
+_RCL_ACTIONS = {2: FlightMode.RTL, 3: FlightMode.LAND}  # NAV_RCL_ACT; 1 stays in Hold
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +115,8 @@ class Autopilot:
         self._ground_since_s: float | None = None
         self._landed_at_s = 0.0
         self._last_step_s: float | None = None
+        self.sticks = Sticks()
+        self._pilot_lost_s: float | None = None
 
     # ---- what telemetry reports
 
@@ -126,6 +142,11 @@ class Autopilot:
         return self.now_s - self._setpoint_time_s < self.parameters.get("COM_OF_LOSS_T")
 
     @property
+    def has_pilot(self) -> bool:
+        """Whether stick input came within COM_RC_LOSS_T."""
+        return self.now_s - self.sticks.time_s < self.parameters.get("COM_RC_LOSS_T")
+
+    @property
     def system_status(self) -> SystemStatus:
         """HEARTBEAT.system_status."""
         if self.armed:
@@ -147,6 +168,19 @@ class Autopilot:
         """A valid offboard setpoint arrived now."""
         self._setpoint = setpoint
         self._setpoint_time_s, self._setpoint_fresh = self.now_s, True
+
+    def set_sticks(self, sticks: Sticks) -> None:
+        """Stick input arrived now. Moving sticks take the vehicle over where COM_RC_OVERRIDE says so (override.json)."""
+        get = self.parameters.get
+        if int(get("COM_RC_IN_MODE")) in (_RADIO_ONLY, _STICKS_DISABLED):
+            return
+        before, self.sticks = self.sticks, sticks
+        wanted = _OVERRIDE_OFFBOARD if self.mode is FlightMode.OFFBOARD else _OVERRIDE_AUTO
+        if not self.armed or self.mode.needs_pilot or not int(get("COM_RC_OVERRIDE")) & wanted:
+            return
+        if moved(before, sticks, get("COM_RC_STICK_OV") / 100.0):
+            self.say(INFO, "Pilot took over using sticks")
+            self._intend(FlightMode.POSCTL)
 
     def arm(self, force: bool = False) -> Result:
         """Arm; `force` skips the checks."""
@@ -235,6 +269,7 @@ class Autopilot:
         if not self.armed:
             self.landed = self.landed or state.on_ground
             return self.output
+        self._check_pilot_loss()
         self._check_offboard_loss()
         if not self.armed:
             return self.output
@@ -248,6 +283,8 @@ class Autopilot:
     def _run(self, task: FlightTask, dt_s: float) -> MotionCommand:
         if isinstance(task, OffboardTask):
             task.setpoint = self._setpoint
+        elif isinstance(task, PositionTask):
+            task.sticks = self.sticks
         was_landing = task.landing
         command = task.update(self.state, dt_s)
         self.target = command.target
@@ -261,13 +298,13 @@ class Autopilot:
     def _can_fly(self, mode: FlightMode) -> bool:
         if mode is FlightMode.OFFBOARD:
             return self.stream_alive
-        return not mode.needs_pilot and mode is not FlightMode.MISSION
+        return self.has_pilot if mode.needs_pilot else mode is not FlightMode.MISSION
 
     def _intend(self, mode: FlightMode) -> None:
         self.intended = mode
         if mode not in (FlightMode.LAND, FlightMode.RTL):
             self._after_disarming = mode
-        self.failsafe = False
+        self.failsafe, self._pilot_lost_s = False, None
         self._enter(mode)
 
     def _enter(self, mode: FlightMode) -> None:
@@ -282,6 +319,8 @@ class Autopilot:
         parameters, state = self.parameters, self.state
         if self.mode is FlightMode.OFFBOARD:
             return OffboardTask(parameters, self._setpoint)
+        if self.mode.needs_pilot:
+            return PositionTask(parameters, state, self.sticks)
         if self.mode is FlightMode.TAKEOFF:
             return TakeoffTask(parameters, state, self._takeoff_target_down_m())
         if self.mode is FlightMode.LAND:
@@ -308,7 +347,7 @@ class Autopilot:
 
     def _check_offboard_loss(self) -> None:
         """The failsafe of OFFBOARD: acts when the stream is lost, gives the vehicle back when it resumes."""
-        if self.intended is not FlightMode.OFFBOARD:
+        if self.intended is not FlightMode.OFFBOARD or self._pilot_lost_s is not None:
             return
         if self.failsafe and self.stream_alive:
             self.failsafe = False
@@ -318,9 +357,33 @@ class Autopilot:
             self.say(CRITICAL, "Failsafe activated")
             action = int(self.parameters.get("COM_OBL_RC_ACT"))
             self._task_target = self._task_yaw_rad = None
-            self._enter(_OBL_ACTIONS.get(action, FlightMode.RTL))
+            fallback = FlightMode.POSCTL if action == 0 and self.has_pilot else FlightMode.RTL
+            self._enter(_OBL_ACTIONS.get(action, fallback))
             if action in _OBL_STOP_MOTORS:
                 self._disarm("failsafe")
+
+    def _check_pilot_loss(self) -> None:
+        """The failsafe of a pilot who was there and is gone: Hold at once, NAV_RCL_ACT after COM_FAIL_ACT_T."""
+        get = self.parameters.get
+        action = int(get("NAV_RCL_ACT"))
+        if self._pilot_lost_s is not None:
+            if self.mode is FlightMode.LOITER and self.now_s - self._pilot_lost_s >= get("COM_FAIL_ACT_T") and action != 1:
+                self._enter(_RCL_ACTIONS.get(action, FlightMode.LOITER))
+            return
+        if self.has_pilot or not math.isfinite(self.sticks.time_s) or self._pilot_may_be_absent(action):
+            return
+        self.failsafe, self._pilot_lost_s = True, self.now_s
+        self._task_target = self._task_yaw_rad = None
+        self.say(CRITICAL, f"Failsafe activated: entering Hold for {get('COM_FAIL_ACT_T'):.0f} seconds")
+        self._enter(FlightMode.LOITER)
+
+    def _pilot_may_be_absent(self, action: int) -> bool:
+        if self.mode.needs_pilot:
+            return False
+        excepted = int(self.parameters.get("COM_RCL_EXCEPT"))
+        if self.mode is FlightMode.OFFBOARD:
+            return action == 0 or bool(excepted & _EXCEPT_OFFBOARD)
+        return self.mode is not FlightMode.LOITER or action == 0 or self.failsafe or bool(excepted & _EXCEPT_HOLD)
 
     def _through_takeoff_ramp(self, command: MotionCommand) -> ControlOutput:
         """Hold a climb back while motors spool up (COM_SPOOLUP_TIME), then let its speed grow over MPC_TKO_RAMP_T."""

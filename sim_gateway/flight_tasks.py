@@ -13,6 +13,7 @@ from typing import Protocol
 from sim_gateway.local_frame import NedState, Vector, wrap_pi
 from sim_gateway.parameters import ParameterStore
 from sim_gateway.setpoints import NAN, NOTHING, OffboardSetpoint
+from sim_gateway.sticks import Sticks
 
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _STOPPED_M_S = 0.15
@@ -287,3 +288,30 @@ class OffboardTask:
         if math.isfinite(self.setpoint.yaw_rad):
             rate += self.parameters.get("MC_YAW_P") * wrap_pi(self.setpoint.yaw_rad - state.yaw_rad)
         return _clamp(rate, -limit, limit)
+
+
+@dataclass(slots=True)
+class PositionTask:
+    """POSCTL (and the other stick modes, flown alike): sticks are velocities in the heading frame; centred, it stands still."""
+
+    parameters: ParameterStore
+    state_at_entry: NedState
+    sticks: Sticks
+    finished: bool = False
+    landing: bool = False
+    _motion: _Motion = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._motion = _Motion(self.parameters, self.state_at_entry.velocity)
+
+    def update(self, state: NedState, dt_s: float) -> MotionCommand:
+        """Setpoint that the sticks ask for: full deflection is MPC_VEL_MANUAL, MPC_Z_VEL_MAX_* and MPC_MAN_Y_MAX."""
+        get, sticks = self.parameters.get, self.sticks
+        cos, sin = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
+        full = get("MPC_VEL_MANUAL")
+        north = full * (cos * sticks.ahead - sin * sticks.right)
+        east = full * (sin * sticks.ahead + cos * sticks.right)
+        down = -sticks.up * get("MPC_Z_VEL_MAX_UP" if sticks.up > 0.0 else "MPC_Z_VEL_MAX_DN")
+        velocity = self._motion.towards(limit_velocity((north, east, down), self.parameters), dt_s)
+        yaw_rate = math.radians(get("MPC_MAN_Y_MAX")) * sticks.turn
+        return MotionCommand(velocity, yaw_rate, OffboardSetpoint(NOTHING, velocity, NOTHING, NAN, yaw_rate))

@@ -7,9 +7,13 @@ import math
 import select
 import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sim_gateway.flight_report import FlightRecorder, write_json_atomically
 from sim_gateway.lidar import LidarConfig
@@ -67,7 +71,11 @@ def warm_up(world: World) -> None:
 
 
 class Gateway:
-    """Everything that answers on a port. Use as a context manager; `run` returns when asked to stop."""
+    """Everything that answers on a port. Use as a context manager; `run` returns when asked to stop.
+
+    For tests in process: `carry` gives position and yaw at a vehicle time, as if a hand moved the vehicle (motors off);
+    `alter_scan` changes a scan before it is sent, or swallows it (None); `telemetry` has switches for its messages.
+    """
 
     def __init__(self, world: World, config: GatewayConfig | None = None) -> None:
         self.world, self.config = world, config or GatewayConfig()
@@ -79,6 +87,8 @@ class Gateway:
         onboard = (config.onboard_port + ONBOARD_PORT_OFFSET, config.onboard_port)
         ground = (config.gcs_port + GROUND_PORT_OFFSET, config.gcs_port) if config.gcs_port else None
         self.server = MavlinkServer(pilot, frame, self.telemetry, onboard, ground)
+        self.carry: Callable[[float], tuple[Point, float]] | None = None
+        self.alter_scan: Callable[[NDArray[np.float32]], NDArray[np.float32] | None] | None = None
         self.lidar = ScipServer(lambda: self.vehicle.time_s, config.lidar_port)
         self.dropped_s = 0.0
         self._started_s = math.nan
@@ -149,6 +159,8 @@ class Gateway:
     def step(self) -> None:
         """One physics step of 4 ms with everything that hangs on it."""
         vehicle = self.vehicle
+        if self.carry is not None:
+            vehicle.simulation.carry(*self.carry(vehicle.time_s))
         vehicle.advance(1)
         self.recorder.watch()
         if self.serial_lidar is not None:
@@ -156,8 +168,10 @@ class Gateway:
         if vehicle.simulation.steps >= step_at(self._scans * 0.05):
             self._scans += 1
             scan = vehicle.simulation.scan()
-            self.lidar.publish(scan.time_s, scan.ranges_m)
-            self.telemetry.scan = scan
+            ranges = self.alter_scan(scan.ranges_m) if self.alter_scan is not None else scan.ranges_m
+            if ranges is not None:
+                self.lidar.publish(scan.time_s, ranges)
+                self.telemetry.scan = replace(scan, ranges_m=ranges)
         self.server.poll()
         self._note_changes()
 
@@ -179,10 +193,21 @@ class Gateway:
         elapsed_s = max(time.monotonic() - self._started_s, 1e-9)
         factor = round(self.vehicle.time_s / elapsed_s, 4)
         content = self.recorder.as_dict(real_time_factor=factor, dropped_s=round(self.dropped_s, 3))
+        content["received"] = self._received()
         try:
             write_json_atomically(self.config.report, content)
         except OSError as error:
             _log.error("the report %s cannot be written: %s", self.config.report, error.strerror)
+
+    def _received(self) -> list[dict[str, Any]]:
+        """What moved, armed or configured the vehicle came over the wire: kind, sender, how often, first and last time."""
+        found: dict[tuple[str, tuple[int, int]], list[float]] = {}
+        for item in self.server.wire_log:
+            found.setdefault((item.what, item.sender), []).append(round(item.time_s, 3))
+        return [
+            {"what": what, "from": f"{sender[0]}/{sender[1]}", "count": len(times), "first_s": times[0], "last_s": times[-1]}
+            for (what, sender), times in found.items()
+        ]
 
     def _facts(self) -> dict[str, Any]:
         world, config = self.world, self.config

@@ -11,7 +11,7 @@ import logging
 import math
 import socket
 import struct
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,10 +19,12 @@ from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.autopilot import CRITICAL, Autopilot, StatusText
 from sim_gateway.commands import Command, CommandHandler
+from sim_gateway.fence import FENCE, FenceStore
 from sim_gateway.flight_modes import FlightMode, Result
 from sim_gateway.local_frame import LocalFrame
 from sim_gateway.parameters import HASH_INDEX, HASH_NAME, UINT32, ParameterStore
 from sim_gateway.setpoints import NAN, NOTHING, SetpointRefusedError, read_setpoint
+from sim_gateway.sticks import from_manual_control
 from sim_gateway.telemetry import COMPONENT_ID, GROUND, ONBOARD, STREAM_RATES_HZ, SYSTEM_ID, Message, Telemetry
 
 LOOPBACK = "127.0.0.1"
@@ -39,11 +41,39 @@ _MIN_INTERVAL_US = 1000.0
 _GLOBAL_FRAMES = (0, 5, 3, 6)  # absolute and relative altitude
 _RELATIVE_FRAMES = (3, 6)
 
+_WIRE_LOG = 20_000  # a quarter of an hour of setpoints at 20 Hz
+_WIRE_SENDERS = 1_000  # kinds of message and sender that are counted
+_COMMANDS_LOGGED = {
+    mav.MAV_CMD_DO_SET_MODE: "DO_SET_MODE",
+    mav.MAV_CMD_COMPONENT_ARM_DISARM: "ARM_DISARM",
+    mav.MAV_CMD_NAV_TAKEOFF: "NAV_TAKEOFF",
+    mav.MAV_CMD_NAV_LAND: "NAV_LAND",
+    mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: "NAV_RETURN_TO_LAUNCH",
+    mav.MAV_CMD_DO_REPOSITION: "DO_REPOSITION",
+}
+_SETPOINTS_LOGGED = (
+    "SET_POSITION_TARGET_LOCAL_NED",
+    "SET_POSITION_TARGET_GLOBAL_INT",
+    "SET_ATTITUDE_TARGET",
+    "SET_ACTUATOR_CONTROL_TARGET",
+    "SET_MODE",
+    "PARAM_SET",
+)
+
 _log = logging.getLogger("sim_gateway.mavlink")
 
 
 class PortInUseError(OSError):
     """A port the gateway needs is taken; the message names it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """One message that moves, arms or configures the vehicle, as it came off the wire. `what`: message or command name."""
+
+    time_s: float
+    what: str
+    sender: tuple[int, int]
 
 
 @dataclass(slots=True)
@@ -206,6 +236,9 @@ class MavlinkServer:
             raise
         self._shown_mode: tuple[FlightMode, FlightMode] | None = None
         self._shown_landed = -1
+        self.fence = FenceStore(self._now)
+        self.counts: Counter[tuple[str, int, int]] = Counter()
+        self.wire_log: deque[Received] = deque(maxlen=_WIRE_LOG)
         self._handlers: dict[str, Callable[[Message, MavlinkLink], None]] = {
             "HEARTBEAT": self._on_heartbeat,
             "COMMAND_LONG": self._on_command_long,
@@ -219,6 +252,10 @@ class MavlinkServer:
             "MISSION_REQUEST_LIST": self._on_mission_list,
             "MISSION_COUNT": self._on_mission_count,
             "MISSION_CLEAR_ALL": self._on_mission_clear,
+            "MISSION_ITEM_INT": self._on_fence_message(self.fence.on_item),
+            "MISSION_REQUEST_INT": self._on_fence_message(self.fence.on_request),
+            "MISSION_ACK": self._on_fence_message(self.fence.on_ack),
+            "MANUAL_CONTROL": self._on_manual_control,
             "TIMESYNC": self._on_timesync,
             "PING": self._on_ping,
         }
@@ -235,6 +272,7 @@ class MavlinkServer:
                 self._dispatch(message, link)
         self._send_changes()
         for link in self.links:
+            self.fence.poll(link.send)
             for name in link.due(self._telemetry.available):
                 link.send(self._telemetry.build(name))
             for _ in range(min(_PARAMS_PER_POLL, len(link.parameter_queue))):
@@ -257,13 +295,29 @@ class MavlinkServer:
         self._shown_mode, self._shown_landed = mode, landed
 
     def _dispatch(self, message: Message, link: MavlinkLink) -> None:
-        handler = self._handlers.get(message.get_type())
-        if handler is None or message.get_srcSystem() == SYSTEM_ID:
+        if message.get_srcSystem() == SYSTEM_ID or getattr(message, "target_system", 0) not in (0, SYSTEM_ID):
             return
-        if getattr(message, "target_system", 0) not in (0, SYSTEM_ID):
+        self._count(message)
+        handler = self._handlers.get(message.get_type())
+        if handler is None:
             return
         if getattr(message, "target_component", 0) in (0, COMPONENT_ID):
             handler(message, link)
+
+    def _count(self, message: Message) -> None:
+        """Count by kind and sender; log what moves, arms or configures the vehicle."""
+        name, sender = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
+        if (name, *sender) in self.counts or len(self.counts) < _WIRE_SENDERS:
+            self.counts[name, *sender] += 1
+        command = _COMMANDS_LOGGED.get(message.command) if name in ("COMMAND_LONG", "COMMAND_INT") else None
+        if name in _SETPOINTS_LOGGED or command is not None:
+            self.wire_log.append(Received(self._now(), command or name, sender))
+
+    def _on_manual_control(self, m: Message, _: MavlinkLink) -> None:
+        """A joystick. Its target field is a system id of its own name."""
+        sticks = from_manual_control(self._now(), m.x, m.y, m.z, m.r) if m.target in (0, SYSTEM_ID) else None
+        if sticks is not None:
+            self._autopilot.set_sticks(sticks)
 
     def _on_heartbeat(self, message: Message, link: MavlinkLink) -> None:
         if message.type == mav.MAV_TYPE_GCS:
@@ -361,16 +415,35 @@ class MavlinkServer:
             for other in (link, *(x for x in self.links if x is not link)):
                 self._send_parameter(name, other)
 
-    # ---- missions are not flown; a client that asks gets an empty list
+    # ---- a fence is stored; missions are not flown: a client that asks gets an empty list
+
+    @staticmethod
+    def _on_fence_message(
+        handler: Callable[[Message, Callable[[Message], None]], None],
+    ) -> Callable[[Message, MavlinkLink], None]:
+        def handle(m: Message, link: MavlinkLink) -> None:
+            if m.mission_type == FENCE:
+                handler(m, link.send)
+
+        return handle
 
     def _on_mission_list(self, m: Message, link: MavlinkLink) -> None:
+        if m.mission_type == FENCE:
+            self.fence.on_list(m, link.send)
+            return
         link.send(mav.MAVLink_mission_count_message(m.get_srcSystem(), m.get_srcComponent(), 0, m.mission_type))
 
     def _on_mission_count(self, m: Message, link: MavlinkLink) -> None:
+        if m.mission_type == FENCE:
+            self.fence.on_count(m, link.send)
+            return
         result = mav.MAV_MISSION_ACCEPTED if m.count == 0 else mav.MAV_MISSION_UNSUPPORTED
         link.send(mav.MAVLink_mission_ack_message(m.get_srcSystem(), m.get_srcComponent(), result, m.mission_type))
 
     def _on_mission_clear(self, m: Message, link: MavlinkLink) -> None:
+        if m.mission_type == FENCE:
+            self.fence.on_clear(m, link.send)
+            return
         ack = mav.MAV_MISSION_ACCEPTED
         link.send(mav.MAVLink_mission_ack_message(m.get_srcSystem(), m.get_srcComponent(), ack, m.mission_type))
 

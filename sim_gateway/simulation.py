@@ -40,6 +40,7 @@ from sim_gateway.vehicle import (
     LANDED,
     OMEGA,
     POS,
+    QUAT,
     STEP_S,
     VEL,
     initial_state,
@@ -218,6 +219,13 @@ class Simulation:
         if setpoint.shape != (3,) or not np.isfinite(setpoint).all() or not math.isfinite(yaw_rate_sp):
             raise ValueError(f"setpoint {velocity_sp}, {yaw_rate_sp}: give three finite velocities and a finite yaw rate")
         self._step(n_steps, setpoint, float(yaw_rate_sp), motors_on=True)
+
+    def carry(self, position_m: Sequence[float], yaw_rad: float, velocity_m_s: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        """Put the vehicle there, level, as a hand would: the next step starts from this motion (corridor frame)."""
+        state = self._state
+        state[POS : POS + 3], state[VEL : VEL + 3] = position_m, velocity_m_s
+        state[QUAT : QUAT + 4] = (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
+        state[OMEGA : OMEGA + 3] = 0.0
 
     def advance_motors_off(self, n_steps: int) -> None:
         """Let `n_steps` of 4 ms pass with the motors off: at rest on the ground, falling in the air."""

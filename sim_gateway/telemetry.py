@@ -111,6 +111,7 @@ class Telemetry:
     """Builds messages for the vehicle's present state. `snapshot` is called once per message, `now_s` gives vehicle time.
 
     `scan`: the newest scan, set by who has the LiDAR; OBSTACLE_DISTANCE tells of it.
+    Fault switches: messages named in `silent` are not streamed, and `alter[name]` may change a message before it is sent.
     """
 
     def __init__(
@@ -122,6 +123,8 @@ class Telemetry:
         self._snapshot = snapshot
         self._sequence = 0
         self.scan: Scan | None = None
+        self.silent: set[str] = set()
+        self.alter: dict[str, Callable[[Message], None]] = {}
         self._builders: dict[str, Callable[[Snapshot], Message]] = {
             name: getattr(self, f"_{name.lower()}") for name in (*STREAM_RATES_HZ, "AUTOPILOT_VERSION")
         }
@@ -133,13 +136,16 @@ class Telemetry:
 
     def available(self, name: str) -> bool:
         """Whether start-up has come far enough for this message, and what it tells of is there."""
-        if name == "OBSTACLE_DISTANCE" and self.scan is None:
+        if name in self.silent or (name == "OBSTACLE_DISTANCE" and self.scan is None):
             return False
         return self.now_s() >= _FROM_S.get(name, LOCAL_FROM_S)
 
     def build(self, name: str) -> Message:
         """The message now; raises KeyError for a name outside the tables."""
-        return self._builders[name](self._snapshot())
+        message = self._builders[name](self._snapshot())
+        if name in self.alter:
+            self.alter[name](message)
+        return message
 
     # ---- identity and status
 

@@ -1,0 +1,154 @@
+"""The MAVLink mission protocol for geofence items: upload, download, clear, as PX4 answers it (geofence.json).
+
+Only `mission_type` FENCE is stored; missions and rally points stay unsupported. The stored fence is not enforced by the gateway:
+it is there so that a client's upload can be checked and read back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import development as mav
+
+from sim_gateway.telemetry import Message
+
+FENCE = mav.MAV_MISSION_TYPE_FENCE
+MAX_ITEMS = 100
+REQUEST_AGAIN_S, GIVE_UP_S = 0.25, 5.0
+_COMMANDS = range(mav.MAV_CMD_NAV_FENCE_RETURN_POINT, mav.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION + 1)
+_FRAMES = (0, 5, 3, 6)  # MAV_FRAME_GLOBAL and GLOBAL_RELATIVE_ALT, as float and as scaled integers
+_SCALED_LIMITS = (900_000_000, 1_800_000_000)  # latitude and longitude, 1e-7 degrees
+
+
+@dataclass(frozen=True, slots=True)
+class FenceItem:
+    """One vertex or circle. `params`: 1 to 4 of the item; latitude and longitude in 1e-7 degrees."""
+
+    command: int
+    frame: int
+    params: tuple[float, float, float, float]
+    latitude_e7: int
+    longitude_e7: int
+
+
+@dataclass(slots=True)
+class _Upload:
+    partner: tuple[int, int]
+    count: int
+    items: list[FenceItem]
+    asked_s: float
+    heard_s: float
+
+
+class FenceStore:
+    """The fence of one vehicle, and the protocol around it. `uploads`, `downloads`, `clears`: completed ones."""
+
+    def __init__(self, now_s: Callable[[], float]) -> None:
+        self.items: tuple[FenceItem, ...] = ()
+        self.uploads = self.downloads = self.clears = 0
+        self._now_s = now_s
+        self._upload: _Upload | None = None
+
+    def on_count(self, message: Message, send: Callable[[Message], None]) -> None:
+        """MISSION_COUNT: an upload begins (0 items: clears), each item is asked for in turn."""
+        partner = _sender(message)
+        if message.count > MAX_ITEMS:
+            send(_ack(partner, mav.MAV_MISSION_NO_SPACE))
+            return
+        if message.count == 0:
+            self.on_clear(message, send)
+            return
+        now_s = self._now_s()
+        self._upload = _Upload(partner, message.count, [], now_s, now_s)
+        self._ask(send)
+
+    def on_item(self, message: Message, send: Callable[[Message], None]) -> None:
+        """MISSION_ITEM_INT of an upload: the expected one is kept, another one makes it ask again."""
+        upload, partner = self._upload, _sender(message)
+        if upload is None or upload.partner != partner:
+            send(_ack(partner, mav.MAV_MISSION_INVALID_SEQUENCE if upload is None else mav.MAV_MISSION_DENIED))
+            return
+        upload.heard_s = self._now_s()
+        if message.seq != len(upload.items):
+            self._ask(send)
+            return
+        problem = _item_problem(message)
+        if problem is not None:
+            self._upload = None
+            send(_ack(partner, problem))
+            return
+        params = (message.param1, message.param2, message.param3, message.param4)
+        upload.items.append(FenceItem(message.command, message.frame, params, message.x, message.y))
+        if len(upload.items) < upload.count:
+            self._ask(send)
+            return
+        self.items, self._upload = tuple(upload.items), None
+        self.uploads += 1
+        send(_ack(partner, mav.MAV_MISSION_ACCEPTED))
+
+    def on_list(self, message: Message, send: Callable[[Message], None]) -> None:
+        """MISSION_REQUEST_LIST: how many items there are."""
+        send(mav.MAVLink_mission_count_message(*_sender(message), len(self.items), FENCE))
+
+    def on_request(self, message: Message, send: Callable[[Message], None]) -> None:
+        """MISSION_REQUEST_INT: one item of a download."""
+        partner = _sender(message)
+        if message.seq >= len(self.items):
+            send(_ack(partner, mav.MAV_MISSION_INVALID_SEQUENCE))
+            return
+        item = self.items[message.seq]
+        place = (item.latitude_e7, item.longitude_e7, 0.0)
+        send(
+            mav.MAVLink_mission_item_int_message(
+                *partner, message.seq, item.frame, item.command, 0, 1, *item.params, *place, FENCE
+            )
+        )
+
+    def on_ack(self, _message: Message, _send: Callable[[Message], None]) -> None:
+        """MISSION_ACK: a client has everything it asked for."""
+        self.downloads += 1
+
+    def on_clear(self, message: Message, send: Callable[[Message], None]) -> None:
+        """MISSION_CLEAR_ALL: nothing is left."""
+        self.items, self._upload = (), None
+        self.clears += 1
+        send(_ack(_sender(message), mav.MAV_MISSION_ACCEPTED))
+
+    def poll(self, send: Callable[[Message], None]) -> None:
+        """Ask again for an item that does not come; give an upload up that has fallen silent."""
+        upload = self._upload
+        if upload is None:
+            return
+        now_s = self._now_s()
+        if now_s - upload.heard_s > GIVE_UP_S:
+            self._upload = None
+            send(_ack(upload.partner, mav.MAV_MISSION_OPERATION_CANCELLED))
+        elif now_s - upload.asked_s > REQUEST_AGAIN_S:
+            self._ask(send)
+
+    def _ask(self, send: Callable[[Message], None]) -> None:
+        upload = self._upload
+        if upload is not None:
+            upload.asked_s = self._now_s()
+            send(mav.MAVLink_mission_request_int_message(*upload.partner, len(upload.items), FENCE))
+
+
+def _item_problem(message: Message) -> int | None:
+    """MAV_MISSION_RESULT of an item that cannot be stored, or None."""
+    if message.command not in _COMMANDS:
+        return int(mav.MAV_MISSION_UNSUPPORTED)
+    if message.frame not in _FRAMES:
+        return int(mav.MAV_MISSION_UNSUPPORTED_FRAME)
+    if abs(message.x) > _SCALED_LIMITS[0] or abs(message.y) > _SCALED_LIMITS[1] or not math.isfinite(message.param1):
+        return int(mav.MAV_MISSION_INVALID)
+    return None
+
+
+def _sender(message: Message) -> tuple[int, int]:
+    return int(message.get_srcSystem()), int(message.get_srcComponent())
+
+
+def _ack(partner: tuple[int, int], result: int) -> Message:
+    return mav.MAVLink_mission_ack_message(*partner, result, FENCE)
