@@ -215,6 +215,21 @@ def test_points_seen_later_from_a_vehicle_that_flew_on() -> None:
     assert (x[0], y[0]) == pytest.approx((0.0, -1.0)), "turned left: what was ahead is right"
 
 
+@given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), st.floats(-1.5, 1.5), st.floats(-0.15, 0.15))
+@settings(max_examples=60, deadline=None)
+def test_points_seen_later_agree_with_the_path_integrated(ahead: float, left: float, yaw_rate: float, later_s: float) -> None:
+    steps, place, yaw = 200, np.zeros(2), 0.0
+    for _ in range(steps):
+        yaw += 0.5 * yaw_rate * later_s / steps
+        velocity = np.array([ahead * math.cos(yaw) - left * math.sin(yaw), ahead * math.sin(yaw) + left * math.cos(yaw)])
+        place = place + velocity * later_s / steps
+        yaw += 0.5 * yaw_rate * later_s / steps
+    to = np.array([2.0, -1.0]) - place
+    expected = (math.cos(yaw) * to[0] + math.sin(yaw) * to[1], math.cos(yaw) * to[1] - math.sin(yaw) * to[0])
+    x, y = seen_later(np.array([2.0]), np.array([-1.0]), np.array([later_s]), BodyMotion(ahead, left, yaw_rate))
+    assert (x[0], y[0]) == pytest.approx(expected, abs=2e-3)
+
+
 def test_body_motion_of_a_state() -> None:
     state = VehicleState(
         0.0, CorridorVector(0, 0, 0), CorridorVector(0.0, 2.0, 0.0), CorridorVector(0, 0, 0), 0.0, 0.0, math.pi / 2, 0.3
