@@ -6,6 +6,7 @@ counted on the vehicle's side of the wire, from the instant at which the vehicle
 
 from __future__ import annotations
 
+import gc
 import math
 import threading
 import time
@@ -53,6 +54,14 @@ HOLD, LOITER = (4, 3), "AUTO.LOITER"
 def air(tmp_path_factory: pytest.TempPathFactory, seeker_policy: Path) -> Iterator[Air]:
     with open_air(tmp_path_factory.mktemp("air"), seeker_policy, QUICK_TAKEOFF) as air:
         yield air
+
+
+@pytest.fixture(autouse=True)
+def no_collection(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The flight's full collection before the loop (30 ms on its own) takes a second here, where trainer and simulator share its
+    heap, and the vehicle in this process would stand still meanwhile."""
+    for name in ("collect", "freeze", "unfreeze"):
+        monkeypatch.setattr(gc, name, lambda: 0)
 
 
 @dataclass
