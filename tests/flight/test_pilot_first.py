@@ -195,10 +195,11 @@ def two_changes_in_a_row(air: Air) -> None:
 
 
 def back_to_offboard_at_once(air: Air) -> None:
-    """Hold and OFFBOARD again in one burst: the mode of the moment says OFFBOARD, and still it is not ours any more."""
+    """Hold and OFFBOARD again within one tick of the loop: the mode of the moment says OFFBOARD, and still it is not ours any more."""
     in_offboard(air)
     seen = len(air.gateway.recorder.events)
     air.station.mode(*HOLD)
+    time.sleep(0.012)  # PX4 reports a change when its link's turn comes; what it does not report, nobody can know
     air.station.mode(6)
     air.wait(lambda: [event["mode"] for event in air.gateway.recorder.events[seen:]][:2] == [LOITER, "OFFBOARD"])
     _MARKS["taken"] = air.gateway.vehicle.time_s
@@ -280,7 +281,7 @@ def test_after_disarming_in_flight_nothing_is_sent(air: Air) -> None:
     """A kill shows in the heartbeat, once a second: setpoints end with it, and nothing arms again."""
     flown = engagement(air, by_disarming, grace_s=DISARM_S)
     assert flown.late == []
-    assert flown.ending.outcome == "disarmed"
+    assert flown.ending.outcome in ("disarmed", "landed_in_flight"), flown  # it falls: the ground may come first
     assert air.autopilot.armed is False
     assert "ARM_DISARM" not in [what for _, what in air.received(flown.taken_s)]
 
