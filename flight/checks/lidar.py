@@ -40,13 +40,13 @@ def check_content(scans: Sequence[LidarScan]) -> list[Check]:
     returns = float(np.mean(np.isfinite(ranges) & (ranges > 0.0)))
     near = float(np.mean(ranges == 0.0))
     seen = f"{returns:.0%} of beams with a return, {near:.0%} too near"
-    finite = np.isfinite(ranges).any()
-    if finite and all(np.array_equal(ranges[0], row, equal_nan=True) for row in ranges[1:]):
-        return [Check("LiDAR content", Level.FAIL, f"{len(ranges)} identical scans", "the device has frozen: restart it")]
     if near > TOO_NEAR:
         return [
             Check("LiDAR content", Level.FAIL, seen, "something covers the device, or set lidar.blind_sectors_deg for the frame")
         ]
+    finite = np.isfinite(ranges).any()
+    if finite and all(np.array_equal(ranges[0], row, equal_nan=True) for row in ranges[1:]):
+        return [Check("LiDAR content", Level.FAIL, f"{len(ranges)} identical scans", "the device has frozen: restart it")]
     if returns < SEE_NOTHING:
         return [Check("LiDAR content", Level.WARN, seen, "it sees nothing: stand near a wall and check that it is seen")]
     return [Check("LiDAR content", Level.PASS, seen)]

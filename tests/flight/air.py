@@ -125,6 +125,7 @@ class Air:
         self.gateway.carry = lambda _: ((1.0, 0.0, 0.0), 0.0)
         self.station.mode(4, 3)
         self.wait(lambda: self.autopilot.mode.px4_name == "AUTO.LOITER" and self.autopilot.landed)
+        self.wait(lambda: math.dist(self.gateway.vehicle.simulation.truth.position_m, (1.0, 0.0, 0.0)) < 0.1)
         self.gateway.carry = None
         self.link.wait_until(lambda: self.link.armed is False and self.link.mode == 4 | 3 << 8, 5.0)
 
