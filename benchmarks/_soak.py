@@ -76,8 +76,7 @@ def main() -> None:
     gc.collect()
     gc.freeze()
     gc.disable()
-    early_mib = _fly(pilot, log, inputs, ticks)
-    late_mib = resident_mib()
+    early_mib, late_mib = _fly(pilot, log, inputs, ticks)
     gc.enable()
     _write_results(log, runner, folder)
     report = {
@@ -91,17 +90,18 @@ def main() -> None:
     print(json.dumps(report))
 
 
-def _fly(pilot: Pilot, log: FlightLog, inputs: Path, ticks: int) -> float:
-    """All ticks; gives the resident memory after a sixth of them."""
-    early_mib = math.nan
+def _fly(pilot: Pilot, log: FlightLog, inputs: Path, ticks: int) -> tuple[float, float]:
+    """All ticks; gives the resident memory after a sixth of them and at the last one."""
+    early_mib = late_mib = math.nan
     for k, (scan, state, now_s) in enumerate(samples(inputs, ticks)):
         log.append(pilot.tick(scan, state, now_s), now_s + 0.001, 0.0001)
         log.see(scan, state)
         if k + 1 == ticks // 6:
             early_mib = resident_mib()
         if (k + 1) % (ticks // 6) == 0:
-            print(f"   {(k + 1) * TICK_S / 60.0:4.0f} min: {resident_mib():.1f} MiB", file=sys.stderr, flush=True)
-    return early_mib
+            late_mib = resident_mib()
+            print(f"   {(k + 1) * TICK_S / 60.0:4.0f} min: {late_mib:.1f} MiB", file=sys.stderr, flush=True)
+    return early_mib, late_mib
 
 
 def _write_results(log: FlightLog, runner: PolicyRunner, folder: Path) -> None:
