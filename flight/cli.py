@@ -42,7 +42,7 @@ def fly(
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before arming a real vehicle.")] = False,
     shadow: Annotated[
-        bool, typer.Option("--shadow", help="The pilot flies; policy and safety are logged, nothing is sent.")
+        bool, typer.Option("--shadow", help="The pilot flies; what fly would do is logged, nothing is sent.")
     ] = False,
     tether: Annotated[bool, typer.Option("--tether", help="First flights: the mission's reduced limits.")] = False,
 ) -> None:
@@ -59,9 +59,7 @@ def fly(
 def check(
     mission: Annotated[Path, typer.Option(help="Mission file (YAML), see docs/mission.md.")],
     apply: Annotated[bool, typer.Option("--apply", help="Also set the parameters that are wrong, and upload the fence.")] = False,
-    motion: Annotated[
-        bool, typer.Option("--motion", help="Also move and turn the vehicle by hand, to compare the axes.")
-    ] = False,
+    motion: Annotated[bool, typer.Option("--motion", help="Also move and turn the vehicle by hand: do all axes agree?")] = False,
     tether: Annotated[bool, typer.Option("--tether", help="Check against the mission's reduced limits.")] = False,
     as_json: Json = False,
 ) -> None:
