@@ -20,7 +20,7 @@ from pymavlink.dialects.v20 import development as mav
 from stand import free_port
 
 from flight.interrupt import Interrupt
-from flight.lidar import LidarDriver
+from flight.lidar import LidarDriver, open_lidar
 from flight.link import VehicleLink
 from flight.mission import Mission, load_mission
 from flight.status import Status
@@ -147,7 +147,7 @@ def open_air(folder: Path, policy: Path, parameters: dict[str, float] | None = N
         path.write_text(MISSION.format(onboard_port=onboard, policy=policy, sha="", lidar_port=gateway.lidar.port))
         mission, station = load_mission(path), Station(ground + 4020)
         try:
-            with LidarDriver(mission.lidar) as lidar, VehicleLink(mission.vehicle.connection) as link:
+            with open_lidar(mission.lidar) as lidar, VehicleLink(mission.vehicle.connection) as link:
                 link.connect(15.0)
                 link.request_stream_rates(50.0)
                 air = Air(gateway, station, link, lidar, mission, path)
