@@ -11,7 +11,6 @@ from flight.link import VehicleLink
 from flight.px4 import MESSAGE_ID
 
 LISTENED = (
-    "HEARTBEAT",
     "SYS_STATUS",
     "ESTIMATOR_STATUS",
     "GPS_RAW_INT",
@@ -52,6 +51,11 @@ class VehicleFacts:
         """Mean rate since listening began, of the messages that telemetry counts."""
         elapsed_s = max(self._clock() - self._started_s, 1e-3)
         return (self._link.telemetry.counts.get(name, 0) - self._before.get(name, 0)) / elapsed_s
+
+    @property
+    def heartbeat_age_s(self) -> float:
+        """Since the autopilot's last heartbeat."""
+        return self._clock() - self._link.telemetry.heartbeat_s
 
     def ask_version(self) -> None:
         """Request AUTOPILOT_VERSION and measure how long a command takes. No answer leaves both empty."""

@@ -11,6 +11,7 @@ from flight.telemetry import LocalPosition, StatusText
 
 SLOW_ROUND_TRIP_S, TOO_SLOW_ROUND_TRIP_S = 0.1, 0.3
 RATE_SHARE = 0.6
+OLD_HEARTBEAT_S = 2.5
 RECORDED_VERSION, OLDEST_VERSION = (1, 17), (1, 14)
 MAX_REST_SPEED_M_S, MAX_REST_DRIFT_M = 0.5, 0.5
 VAGUE_POSITION_M, LOST_POSITION_M = 1.0, 3.0
@@ -41,10 +42,9 @@ ENOUGH_FIX = 3
 
 def check_link(facts: VehicleFacts, mission: Mission) -> list[Check]:
     """Heartbeat, round trip of a command, rates of the messages the loop needs."""
-    if facts.newest("HEARTBEAT") is None:
-        return [
-            Check("link", Level.FAIL, "no heartbeat since connecting", "check power and cable, and that only one program is fed")
-        ]
+    if facts.heartbeat_age_s > OLD_HEARTBEAT_S:
+        seen = f"last heartbeat {facts.heartbeat_age_s:.1f} s ago"
+        return [Check("link", Level.FAIL, seen, "check power and cable, and that no other program reads this port")]
     trip_s, wanted_hz = facts.round_trip_s, mission.vehicle.stream_rate_hz
     names = ("LOCAL_POSITION_NED", "ATTITUDE", "HIGHRES_IMU")
     rates = {name: facts.rate_hz(name) for name in names}

@@ -168,6 +168,7 @@ VEHICLE_FAULTS: dict[str, tuple[str, Callable[[Any], None] | None, str, Level, s
     "vague": ("ESTIMATOR_STATUS", setting(pos_horiz_accuracy=2.0), "local position", Level.WARN, "2.00 m", "fence"),
     "estimator silent": ("ESTIMATOR_STATUS", None, "local position", Level.FAIL, "no ESTIMATOR_STATUS", "companion link"),
     "runs away": ("LOCAL_POSITION_NED", setting(vx=1.5), "estimate at rest", Level.FAIL, "1.50 m/s", "recalibrate"),
+    "heartbeat silent": ("HEARTBEAT", None, "link", Level.FAIL, "last heartbeat", "check power"),
     "imu silent": ("HIGHRES_IMU", None, "link", Level.FAIL, "HIGHRES_IMU", "baud rate"),
     "old firmware": ("AUTOPILOT_VERSION", setting(flight_sw_version=0x010D0000), "PX4 version", Level.FAIL, "v1.13.0", "update"),
     "new firmware": ("AUTOPILOT_VERSION", setting(flight_sw_version=0x01120000), "PX4 version", Level.WARN, "v1.18.0", "tether"),
@@ -186,7 +187,7 @@ def test_each_fault_of_the_vehicle_in_turn_is_found(air: Air, fault: str) -> Non
         air.telemetry.silent.add(message)
     else:
         air.telemetry.alter[message] = change
-    time.sleep(0.3)
+    time.sleep(2.6 if fault == "heartbeat silent" else 0.3)
     try:
         checks = checkup(air).check_vehicle(air.link, VehicleFacts(air.link), HERE)
     finally:

@@ -195,7 +195,7 @@ def two_changes_in_a_row(air: Air) -> None:
 
 
 def back_to_offboard_at_once(air: Air) -> None:
-    """Hold and OFFBOARD again within one tick of the loop: the mode of the moment says OFFBOARD, and still it is not ours any more."""
+    """Hold and OFFBOARD again within one tick: the mode of the moment says OFFBOARD, and still it is not ours."""
     in_offboard(air)
     seen = len(air.gateway.recorder.events)
     air.station.mode(*HOLD)
