@@ -326,13 +326,13 @@ def test_fence_is_uploaded_downloaded_and_cleared(air: Air, geo: GeoPoint) -> No
     held = client.download()
     assert [item.place for item in held] == fence.vertices(geo)
     assert [item.polygon_size for item in held] == [4] * 4
-    assert (store.uploads, store.downloads) == (before[0] + 1, before[1] + 1)
+    air.wait(lambda: (store.uploads, store.downloads) == (before[0] + 1, before[1] + 1), 2.0)  # the last ack is on its way
     for wanted, item in zip(fence.corners_ned, store.items, strict=True):  # in the vehicle's own projection
         north, east, _ = air.gateway.vehicle.frame.from_global(item.latitude_e7 * 1e-7, item.longitude_e7 * 1e-7, 0.0)
         assert math.hypot(north - wanted.x, east - wanted.y) < 0.02
     client.clear()
     assert client.download() == []
-    assert store.clears == before[2] + 1
+    air.wait(lambda: store.clears == before[2] + 1, 2.0)
 
 
 def test_outer_fence_is_larger_by_the_overshoot_on_every_side(air: Air) -> None:
