@@ -26,6 +26,7 @@ from flight.mission import Mission, load_mission
 from flight.status import Status
 from sim_gateway.gateway import Gateway, GatewayConfig, warm_up
 from sim_gateway.scene import World
+from sim_gateway.sticks import Sticks
 from sim_gateway.telemetry import Telemetry
 
 FLY = (245, 191)
@@ -120,6 +121,7 @@ class Air:
         self.telemetry.alter.clear()
         self.gateway.alter_scan = None
         self.link.authority = None
+        self.autopilot.sticks = Sticks()  # a joystick seen once and gone would be a lost pilot: PX4's failsafe
         self.station.command(400, 0, 21196)
         self.wait(lambda: not self.autopilot.armed)
         self.gateway.carry = lambda _: ((1.0, 0.0, 0.0), 0.0)
