@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight.errors import ExitCode, MissionError
+from flight.flight_log import FlightLog
 from flight.offboard import Ending
+from flight.scan_log import write_scans
+from flight.trajectory import write_timing_csv, write_trajectory_csv
 from safety.frames import CorridorVector
 
 log = logging.getLogger("flight.results")
+
+
+@dataclass(slots=True)
+class FlightResult:
+    """What came of it. `summary` is the content of summary.json; empty where nothing was flown."""
+
+    exit_code: ExitCode
+    outcome: str
+    message: str
+    folder: Path
+    summary: dict[str, object] = field(default_factory=dict)
 
 
 def make_run_folder(wanted: Path | None, name: str) -> Path:
@@ -62,6 +77,14 @@ def truth_from_report(report: Mapping[str, Any]) -> NDArray[np.float64] | None:
     except (ValueError, TypeError):
         return None
     return table[:, 1:4] if table.ndim == 2 and table.shape[1] >= 4 else None
+
+
+def write_log(folder: Path, flight_log: FlightLog) -> None:
+    """Write what was logged tick by tick: trajectory.csv, timing.csv and scans.npz."""
+    write_trajectory_csv(folder / "trajectory.csv", flight_log)
+    write_timing_csv(folder / "timing.csv", flight_log)
+    start_s = flight_log.records[0].now_s if flight_log.records else 0.0
+    write_scans(folder / "scans.npz", flight_log.scans.scans(), start_s)
 
 
 def judge_flight(ending: Ending, landed: bool, contacts: Any) -> tuple[ExitCode, str, str]:

@@ -10,7 +10,7 @@ import logging
 import math
 import time
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -51,14 +51,13 @@ from flight.px4_log import fetch_px4_log
 from flight.realtime import real_time
 from flight.recording_setup import FlightRecording, flight_header, record_flight
 from flight.report import write_report
-from flight.results import judge_flight, true_distance_m, truth_from_report
-from flight.scan_log import write_scans
+from flight.results import FlightResult, judge_flight, true_distance_m, truth_from_report, write_log
 from flight.shadow import ShadowFlight
 from flight.status import Status
 from flight.summary import build_summary, write_json_atomic
 from flight.tether import tethered
 from flight.tick import Pilot
-from flight.trajectory import draw_trajectory_png, write_timing_csv, write_trajectory_csv
+from flight.trajectory import draw_trajectory_png
 from policy_export.errors import PolicyError
 from policy_export.runner import PolicyRunner
 from safety.filter import SafetyFilter
@@ -72,17 +71,6 @@ STILL_FOR_S = 1.0
 BRAKE_S = 1.0
 ARM_RETRY_S = 0.5
 TAKEOFF_ENDS_WITHIN_M = 1.0  # PX4's default NAV_MC_ALT_RAD, 0.8 m, and the error of the estimate
-
-
-@dataclass(slots=True)
-class FlightResult:
-    """What came of it. `summary` is the content of summary.json; empty where nothing was flown."""
-
-    exit_code: ExitCode
-    outcome: str
-    message: str
-    folder: Path
-    summary: dict[str, object] = field(default_factory=dict)
 
 
 class FlightSession:
@@ -375,26 +363,28 @@ class FlightSession:
             },
         )
         write_json_atomic(self._folder / "summary.json", summary)
-        write_trajectory_csv(self._folder / "trajectory.csv", flight.log)
-        write_timing_csv(self._folder / "timing.csv", flight.log)
-        start_s = flight.log.records[0].now_s if flight.log.records else 0.0
-        write_scans(self._folder / "scans.npz", flight.log.scans.scans(), start_s)
-        self._draw(flight, place, report, f"{self._mission.name}: {outcome}")
-        write_report(self._folder)
+        write_log(self._folder, flight.log)
+        self._illustrate(flight, place, report, f"{self._mission.name}: {outcome}")
         return FlightResult(exit_code, outcome, message, self._folder, summary)
 
-    def _draw(self, flight: OffboardFlight | ShadowFlight, place: Place, report: dict[str, Any], title: str) -> None:
+    def _illustrate(self, flight: OffboardFlight | ShadowFlight, place: Place, report: dict[str, Any], title: str) -> None:
+        """Picture and report. The flight is over and its data are written: a failure here is told, and changes nothing else."""
         boxes = np.array(self._ready.boxes, dtype=np.float64).reshape(-1, 6) if self._ready is not None else None
-        draw_trajectory_png(
-            self._folder / "trajectory.png",
-            flight.log,
-            boxes=boxes,
-            goal=place.goal,
-            goal_radius_m=self._mission.goal.radius_m,
-            fence=self._mission.safety.fence,
-            truth=truth_from_report(report),
-            title=title,
-        )
+        mission, folder = self._mission, self._folder
+        try:
+            draw_trajectory_png(
+                folder / "trajectory.png",
+                flight.log,
+                boxes=boxes,
+                goal=place.goal,
+                goal_radius_m=mission.goal.radius_m,
+                fence=mission.safety.fence,
+                truth=truth_from_report(report),
+                title=title,
+            )
+            write_report(folder)
+        except Exception as error:  # noqa: BLE001  (a picture must not turn a good landing into an error)
+            log.warning("no picture or report: %s: %s; try `fly report %s`", type(error).__name__, error, folder)
 
 
 def _outcome(link: VehicleLink) -> str:
