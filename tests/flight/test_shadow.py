@@ -20,7 +20,8 @@ from stand import ROOT
 from flight.errors import ExitCode, MissionError, RefusedError
 from flight.mission import Mission, TetherSection, goal_problem, load_mission
 from flight.preparation import Place
-from flight.session import FlightResult, FlightSession
+from flight.results import FlightResult
+from flight.session import FlightSession
 from flight.tether import tethered
 from safety.frames import CorridorVector
 
