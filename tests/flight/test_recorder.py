@@ -260,7 +260,8 @@ def test_recording_ends_at_its_size_and_the_file_is_whole(tmp_path: Path) -> Non
         for k in range(40):
             feed(recorder, 25, 25 * k)
             time.sleep(0.06)
-    assert said == [f"recording stopped: flight.mcap has reached recording.max_size_mb ({path.stat().st_size / 1e6:.0f} MB)"]
+    assert len(said) == 1
+    assert said[0].startswith("recording stopped: flight.mcap has reached recording.max_size_mb")
     assert 1.0e6 <= path.stat().st_size < 3.0e6
     assert recorder.summary.problem is not None
     assert recorder.summary.ticks == len(read_recording(path).ticks) < 1000

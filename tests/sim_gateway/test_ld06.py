@@ -128,7 +128,7 @@ def test_a_line_nobody_reads_loses_bytes_and_does_not_block(tmp_path: Path) -> N
         for _ in range(100):
             port.write(bytes(1000))
         assert time.monotonic() - started_s < 1.0
-        assert port.lost_bytes > 80_000
+        assert port.lost_bytes > 50_000  # the rest lies in the kernel, whose buffer differs between machines
         assert os.readlink(link) == port.path
         assert port.read() == b""
     assert not link.is_symlink()
