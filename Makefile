@@ -14,7 +14,9 @@ fly: $(VENV)/.setup-fly  ## set up what a simulated flight needs, then fly the m
 
 test: $(VENV)/.setup-dev lint  ## set up everything, then lint, types and all tests
 	@echo "== tests, two at a time (simulated and pure) =="
-	$(BIN)/python -m pytest -n 2 -m "not realtime" -q
+	$(BIN)/python -m pytest -n 2 -m "not realtime" -q || \
+		{ echo "== what failed beside other tests, once more and alone: these machines are shared =="; \
+		  $(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m "not realtime" -q; }
 	@echo "== tests that fly in real time over MAVLink, one at a time =="
 	$(BIN)/python -m pytest -m realtime -v
 

@@ -103,6 +103,7 @@ class Ld06Decoder:
                 place += 1
         if place < 0:  # no header any more; a last 54 may be half of one
             place = len(buffer) - (1 if buffer.endswith(_HEADER[:1]) else 0)
+            place = max(place, ends[-1] if ends else 0)  # a checksum that happens to be 54 is spent
         del self._buffer[:place]
         return frames, [len(buffer) - end for end in ends]
 

@@ -79,6 +79,7 @@ class Device:
         self.refuse: dict[str, str] = {}
         self.stalled = False
         self.frozen_clock = False
+        self._stamp_ms = 0
         self.chunks = False
         self.close_after: int | None = None
         self.clock_offset_s = 12345.678
@@ -147,7 +148,9 @@ class Device:
         return math.floor(1000.0 * (time.monotonic() + self.clock_offset_s)) % 2**24
 
     def _send_scan(self, client: socket.socket) -> None:
-        stamp = 5_000_000 if self.frozen_clock else self.clock_ms()
+        if not self.frozen_clock:
+            self._stamp_ms = self.clock_ms()
+        stamp = self._stamp_ms
         self.measured[self.scans_sent] = time.monotonic()
         message = self.garble(scan_message(self.values(self.scans_sent), stamp))
         self.scans_sent += 1

@@ -6,7 +6,7 @@ import random
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from spinning_peers import LD06_EXAMPLE, bitwise_crc, ld06_frame, ld06_turn
 
@@ -56,6 +56,14 @@ def test_no_return_and_weak_returns_are_unknown() -> None:
     assert np.isnan(strict.feed(frame).range_m).tolist() == [True, True] + [False] * 10
 
 
+CHECKSUM_54 = [
+    *[(470, 207), (223, 239), (223, 239), (4392, 216), (608, 77), (1611, 147)],
+    *[(15981, 227), (15981, 227), (1881, 21), (5108, 189), (8846, 152), (986, 36)],
+]
+"""A frame whose checksum is the byte that begins a header."""
+
+
+@example(CHECKSUM_54, 0.5, 0.5, 1670, [1])
 @given(
     st.lists(st.tuples(st.integers(0, 65535), st.integers(0, 255)), min_size=12, max_size=12),
     st.floats(0.0, 359.9),

@@ -76,6 +76,7 @@ def test_a_refused_command_says_so(link: VehicleLink) -> None:
         link.command_long(31999, what="a nonsense command")
 
 
+@pytest.mark.realtime
 def test_arms_streams_and_engages_offboard(link: VehicleLink) -> None:
     """On the ground with zero velocity: nothing lifts off. The stream is what keeps OFFBOARD alive."""
     still = SafeCommand(CorridorVector(0.0, 0.0, 0.0), 0.0)
