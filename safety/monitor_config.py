@@ -23,16 +23,22 @@ class MonitorConfig(BaseModel):
     jumps_window_s: Positive = Field(5.0, description="E1: a second jump within this time makes HOLD")
     frozen_state_s: Positive = Field(0.2, description="E2: position and velocity may stay the same in every bit this long")
     frozen_command_m_s: Positive = Field(0.3, description="E2: while at least this speed is commanded")
-    direction_rad: Positive = Field(1.2, description="E7: angle between the motion expected from the commands and the estimated one")
-    direction_speed_m_s: Positive = Field(0.35, description="E7: both are at least this fast, else the angle says nothing")
-    direction_s: Positive = Field(0.7, description="E7: how long it may last")
+    direction_speed_m_s: Positive = Field(
+        0.4, description="E7: speed expected from the commands from which their direction counts"
+    )
+    direction_error_m_s: Positive = Field(0.4, description="E7: speed across or against that direction ...")
+    direction_s: Positive = Field(0.7, description="E7: ... and how long it may last")
     accuracy_m: Positive = Field(1.0, description="E5: horizontal accuracy that the autopilot may report (one sigma)")
     accuracy_s: Positive = Field(1.0, description="E5: how long a worse one may last")
     tilt_rad: Positive = Field(0.95, description="tilt beyond what the autopilot ever commands (45 degrees, and overshoot)")
     tumbling_rad: Positive = Field(1.4, description="V9: tilt from which nothing that we send can help")
 
-    mask_s: Positive = Field(0.5, description="L15: a return inside the hull at a fixed bearing this long is part of the vehicle ...")
-    mask_motion_m: Positive = Field(0.2, description="... once the vehicle has moved this far, or turned as many radians, meanwhile")
+    mask_s: Positive = Field(
+        0.5, description="L15: a return inside the hull at a fixed bearing this long is part of the vehicle ..."
+    )
+    mask_motion_m: Positive = Field(
+        0.2, description="... once the vehicle has moved this far, or turned as many radians, meanwhile"
+    )
     mirror_turn_rad: Positive = Field(0.15, description="L9: scans are compared after this much turning")
     mirror_votes: int = Field(4, ge=1, le=100, description="L9: comparisons in a row that must say that left is right")
 
@@ -49,7 +55,9 @@ class MonitorConfig(BaseModel):
     gap_s: Positive = Field(0.25, description="C4: after a longer pause between two calls the first command brakes")
     link_delay_s: Positive = Field(0.5, description="K4: round trip of the link that may not be exceeded ...")
     link_delay_lasts_s: NotNegative = Field(0.4, description="... for longer than this")
-    echo_error_m_s: Positive = Field(0.25, description="K6: the autopilot's own setpoint may differ this much from all that we sent")
+    echo_error_m_s: Positive = Field(
+        0.25, description="K6: the autopilot's own setpoint may differ this much from all that we sent"
+    )
     echo_s: Positive = Field(0.6, description="K6: for this long; and how far back what we sent is looked for")
     battery_low: Share = Field(0.15, description="V6: charge below which the flight ends in HOLD (PX4: BAT_LOW_THR)")
     battery_critical: Share = Field(0.07, description="V6: charge below which the vehicle lands (PX4: BAT_CRIT_THR)")
