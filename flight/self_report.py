@@ -1,7 +1,7 @@
-"""What the autopilot says about itself, besides motion: its estimator's health and resets, the setpoint it follows, how fast it answers.
+"""What the autopilot says about itself: health and resets of its estimator, the setpoint it follows, how fast it answers.
 
-Sources: ODOMETRY.reset_counter (PX4 adds up the resets of attitude, velocity and position), ESTIMATOR_STATUS (flags and horizontal
-accuracy), POSITION_TARGET_LOCAL_NED (the setpoint in force), TIMESYNC answers to our own questions (round trip).
+Sources: ODOMETRY.reset_counter (PX4 adds up the resets of attitude, velocity and position), ESTIMATOR_STATUS (flags and
+horizontal accuracy), POSITION_TARGET_LOCAL_NED (the setpoint in force), TIMESYNC answers to our own questions (round trip).
 """
 
 from __future__ import annotations

@@ -99,8 +99,8 @@ class Pilot:
     def tick(self, scan: LidarScan | None, state: VehicleState | None, now_s: float, health: Health | None = None) -> TickRecord:
         """One step of the whole stack at `now_s`. Never raises for bad samples: they end in a braking command.
 
-        `health`: what the loop knows besides. Where it lacks the inference time, that of this tick is judged; without any `health`
-        the time is not judged at all, because lockstep and replay measure the computer, not the flight.
+        `health`: what the loop knows besides. Where it lacks the inference time, that of this tick is judged; without any
+        `health` no time is judged, because lockstep measures the computer, not the flight.
         """
         known = state if _usable(state) else None
         observation = self._observe(scan, known, now_s)

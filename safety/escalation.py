@@ -1,7 +1,8 @@
 """What follows a fault: FLY -> BRAKE -> HOLD -> LAND -> YIELD, as data. The loop asks once per tick and does what `level` says.
 
-* A fault (`Verdict.fault`) makes BRAKE at once, or the level that `safety.reactions` gives it. A fault that lasts `hold_after_s` makes HOLD; HOLD that lasts `land_after_s`
-  with the fault still there makes LAND. A fault that leaves no usable estimate makes LAND instead of HOLD, which needs one.
+* A fault (`Verdict.fault`) makes BRAKE at once, or the level that `safety.reactions` gives it. A fault that lasts
+  `hold_after_s` makes HOLD; HOLD that lasts `land_after_s` with the fault still there makes LAND.
+  A fault that leaves no usable estimate makes LAND instead of HOLD, which needs one.
 * BRAKE ends by itself only after `healthy_s` without any fault: that is a pause, not a decision. HOLD and LAND never end by
   themselves: only `re_engage`, an operator's act, leaves them. YIELD ends never: the vehicle is somebody else's.
 * Braking for an obstacle or the fence is no fault; only when it lasts `blocked_hold_s` without a break does it make HOLD.

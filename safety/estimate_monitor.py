@@ -1,4 +1,4 @@
-"""Does the estimate agree with itself and with what the autopilot says about it? Jumps, resets, standstill, velocity, tilt, accuracy.
+"""Does the estimate agree with itself and with what the autopilot says about it?
 
 A vehicle cannot be somewhere else than its velocity took it. What the velocity leaves unexplained between two samples is a jump,
 and its mean over a short window is the error of the velocity (or a drift of the position; one cannot tell which).

@@ -12,7 +12,7 @@ Share = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
 class MonitorConfig(BaseModel):
-    """SI units. The defaults raise nothing on recorded flights of PX4's own estimator, whose noise is many times the assumed one."""
+    """SI units. The defaults raise nothing on recorded flights of PX4's estimator, noisier by far than what A4 assumes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -42,7 +42,7 @@ class MonitorConfig(BaseModel):
     mirror_turn_rad: Positive = Field(0.15, description="L9: scans are compared after this much turning")
     mirror_votes: int = Field(4, ge=1, le=100, description="L9: comparisons in a row that must say that left is right")
 
-    hidden_norm_max: Positive = Field(10.5, description="P5: norm of the recurrent state")
+    hidden_norm_max: Positive = Field(9.0, description="P5: norm of the recurrent state")
     bad_commands: int = Field(3, ge=2, le=20, description="P1: so many missing or broken commands within a second make HOLD")
     inference_late_s: Positive = Field(0.03, description="P6: a step of the policy that took longer adds to the delay")
     inference_hung_s: Positive = Field(0.05, description="P7: a step that took longer than this is not believed")

@@ -1,7 +1,7 @@
 """Is the input fit to fly on? Freshness, finiteness and plausibility of command, state and scan, each with its own rule name.
 
-`InputMonitor.judge` names every fault of a tick. A fault always means BRAKE, some mean more; see `safety.reactions` for which, and
-`safety.escalation` for what follows.
+`InputMonitor.judge` names every fault of a tick. A fault always means BRAKE, some mean more (`safety.reactions`); what follows is
+told in `safety.escalation`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Does the policy's output look like that of a healthy network? Broken again and again, memory exploded, late, saturated, oscillating."""
+"""Does the policy's output look like that of a healthy network? Broken, late, saturated, oscillating, memory exploded."""
 
 from __future__ import annotations
 

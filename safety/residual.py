@@ -1,8 +1,8 @@
-"""Does the vehicle still brake and move as assumed (A1, A3)? What it did lately against what the slowest assumed vehicle would have done.
+"""Does the vehicle still brake and move as assumed (A1, A3)? What it did lately, against the slowest assumed vehicle.
 
-The velocity of a moment ago is flown on through the commands sent since, with the assumed dead time and the slowest assumed lag. A
-vehicle inside the assumptions has slowed down at least that much. The share that it managed, braking only, weighted by how much
-was expected and slowly forgotten, is the residual: 1 = exactly as assumed, more = better, less = the assumption is broken.
+The velocity of a moment ago is flown on through the commands sent since, with the assumed dead time and the slowest assumed lag.
+A vehicle inside the assumptions has slowed down at least that much. The share that it managed, braking only, weighted by how
+much was expected and slowly forgotten, is the residual: 1 = exactly as assumed, more = better, less = the assumption is broken.
 Not reaching a commanded speed (V10) is no fault and counts nowhere.
 """
 
