@@ -13,6 +13,7 @@ import pytest
 from flight_records import record
 from hypothesis import given
 from hypothesis import strategies as st
+from recorded_flight import SAFETY, header_of
 
 from campaigns.lockstep import LockstepFlight, StackConfig
 from flight.authority import Authority
@@ -27,7 +28,6 @@ from flight.recording_schema import TickSample, decode_tick, encode_tick, from_p
 from flight.replay import compare
 from flight.telemetry import Telemetry
 from policy_export.runner import PolicyRunner
-from recorded_flight import SAFETY, header_of
 from safety.escalation import Level
 from safety.frames import CorridorFrame, CorridorVector, NedVector
 from safety.messages import Health, Verdict
@@ -79,7 +79,8 @@ def test_reset_counter_is_part_of_the_state() -> None:
 
 
 @pytest.mark.parametrize(
-    ("flags", "valid"), [(0x33F, True), (0x2F, True), (0x37, True), (0x27, False), (0x3E, False), (0x3D, False), (0x3B, False), (0x1F, False)]
+    ("flags", "valid"),
+    [(0x33F, True), (0x2F, True), (0x37, True), (0x27, False), (0x3E, False), (0x3D, False), (0x3B, False), (0x1F, False)],
 )
 def test_estimator_flags(flags: int, valid: bool) -> None:
     """Attitude, both velocities, height, and relative or absolute position are all needed; 0x27 is PX4 before its position."""
@@ -96,7 +97,9 @@ def test_who_has_the_vehicle_is_told() -> None:
     telemetry = told(("HEARTBEAT", {"autopilot": 12, "base_mode": 0x81, "custom_mode": FlightMode.OFFBOARD << 16}))
     authority = Authority(telemetry)
     assert health_of(telemetry, EAST, 0.0, authority).in_control is True
-    telemetry.feed("HEARTBEAT", 1, json.dumps({"autopilot": 12, "base_mode": 0x81, "custom_mode": FlightMode.POSCTL << 16}), 101.0)
+    telemetry.feed(
+        "HEARTBEAT", 1, json.dumps({"autopilot": 12, "base_mode": 0x81, "custom_mode": FlightMode.POSCTL << 16}), 101.0
+    )
     assert health_of(telemetry, EAST, 0.0, authority).in_control is False
     assert health_of(telemetry, EAST, 0.0).in_control is None
 
@@ -192,7 +195,9 @@ def test_exploded_memory_is_reset(seeker_policy: Path) -> None:
     assert runner.resets >= before + len(flight.log.records)
 
 
-@pytest.mark.parametrize(("rule", "in_control"), [("autopilot_rebooted", False), ("battery_low", True), ("battery_critical", True)])
+@pytest.mark.parametrize(
+    ("rule", "in_control"), [("autopilot_rebooted", False), ("battery_low", True), ("battery_critical", True)]
+)
 def test_severe_faults_end_the_flight_at_once(rule: str, in_control: bool) -> None:
     judge = FlightJudge(load_mission(ROOT / "configs" / "corridor.yaml"))
     one = replace(record(0), verdict=Verdict(braking=True, fault=rule), goal_reached=False)

@@ -1,7 +1,7 @@
 """The whole state machine: every state that can be reached from FLY, by every kind of input, in every bucket of time.
 
-A state is reduced to what the rules look at: the level and, for each clock in it, which side of its limits it stands. Time moves in
-steps that hit every side of every limit. The search ends when no new reduced state appears: what holds then, holds always.
+A state is reduced to what the rules look at: the level and, for each clock in it, on which side of its limits it stands. Time
+moves in steps that hit every side of every limit. The search ends when no new reduced state appears: what holds then, holds always.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ STEPS_S = (0.05, 0.95, 1.0, 1.95, 2.0, 9.95, 10.0, 15.0)
 
 def reduced(state: EscalationState, now_s: float) -> tuple[object, ...]:
     """What the next step can depend on."""
+
     def age(since: float | None, *limits: float) -> int:
         return -1 if since is None else sum(now_s - since >= limit for limit in (0.01, *limits))
 

@@ -63,7 +63,7 @@ def test_a_second_jump_soon_is_worse():
     there = cruise(4, shift=(1, 0, 0), at=2)
     back = state(5.0 + 0.5 * 4 * STEP, v=(0.5, 0, 0), time_s=4 * STEP)
     assert rules([*there, back])[-1] == ["estimate_jump_again"]
-    long = cruise(160, shift=(1, 0, 0), at=2) + [state(5.0 + 0.5 * 160 * STEP, v=(0.5, 0, 0), time_s=160 * STEP)]
+    long = [*cruise(160, shift=(1, 0, 0), at=2), state(5.0 + 0.5 * 160 * STEP, v=(0.5, 0, 0), time_s=160 * STEP)]
     assert rules(long)[-1] == ["estimate_jump"]
 
 
@@ -76,6 +76,7 @@ def test_altitude_jump_limit_is_exact(sign):
 
 def test_reset_counter():
     """E8: a change is named at once, also when the position happens to stay; unknown counters say nothing."""
+
     def counted(values):
         return [dataclasses.replace(s, reset_counter=c) for s, c in zip(cruise(len(values)), values, strict=True)]
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safety_vehicle import empty_world, state_of
 
 from campaigns.lockstep import LockstepFlight, StackConfig
 from flight.recording_reader import read_recording
@@ -18,7 +19,6 @@ from safety.reactions import NOTICES, REACTIONS
 from sim_gateway.estimate import PRESETS
 from sim_gateway.simulation import Simulation, step_at
 from sim_gateway.world import load_world
-from safety_vehicle import empty_world, state_of
 
 ROOT = Path(__file__).parents[2]
 POLICY = ROOT / "policies" / "corridor_ppo_lstm.onnx"

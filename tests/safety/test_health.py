@@ -53,7 +53,14 @@ def test_most_severe_fault_is_the_verdicts_fault_and_all_are_told():
     _, verdict = SafetyFilter(config()).apply(None, None, None, 0.0, health)
     rules = [item.rule for item in verdict.interventions]
     assert verdict.fault == "control_lost"
-    assert set(rules) == {"control_lost", "battery_critical", "hidden_exploded", "state_missing", "scan_missing", "command_missing"}
+    assert set(rules) == {
+        "control_lost",
+        "battery_critical",
+        "hidden_exploded",
+        "state_missing",
+        "scan_missing",
+        "command_missing",
+    }
     assert [level_of(rule) for rule in rules] == sorted(map(level_of, rules), reverse=True)
 
 
@@ -216,6 +223,7 @@ def test_any_health_gives_a_finite_command_and_a_known_rule(healths):
 @given(st.floats(-1e5, 1e5))
 def test_shift_of_the_clock_changes_nothing(shift):
     """Must-have: only differences of times count."""
+
     def rules(begin):
         safety, result = SafetyFilter(config()), []
         for k in range(12):

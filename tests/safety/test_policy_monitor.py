@@ -57,7 +57,15 @@ def test_third_bad_command_within_a_second():
 
 
 @pytest.mark.parametrize(
-    "full", [command(1.2), command(0, -1.19), command(0, 0, 0.5), command(0, 0, -0.495), command(0, 0, 0, -1.0), command(0.2, 0, 0, 0.99)]
+    "full",
+    [
+        command(1.2),
+        command(0, -1.19),
+        command(0, 0, 0.5),
+        command(0, 0, -0.495),
+        command(0, 0, 0, -1.0),
+        command(0.2, 0, 0, 0.99),
+    ],
 )
 def test_saturation_is_told_after_two_seconds(full):
     """P2: 32 ticks of 62.5 ms."""
