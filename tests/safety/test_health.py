@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from safety_plant import Plant, command, config, scan, state
 
@@ -195,7 +195,7 @@ def test_default_thresholds_are_the_reviewed_numbers():
         "link_delay_lasts_s": 0.4, "echo_error_m_s": 0.25, "echo_s": 0.6, "battery_low": 0.15, "battery_critical": 0.07,
         "nominal_state_age_s": 0.08, "nominal_scan_age_s": 0.12, "nominal_late_s": 0.02, "nominal_link_delay_s": 0.1,
         "braking_horizon_s": 0.6, "braking_memory_s": 2.0, "braking_weak": 0.9, "braking_healthy": 1.0,
-        "braking_failed": 0.7, "braking_failed_s": 1.0, "cap_least": 0.25,
+        "braking_failed": 0.7, "braking_failed_s": 0.5, "cap_least": 0.25,
     }  # fmt: skip
 
 
@@ -207,6 +207,7 @@ HEALTHS = st.builds(
 )  # fmt: skip
 
 
+@settings(deadline=None)
 @given(st.lists(HEALTHS, min_size=1, max_size=12))
 def test_any_health_gives_a_finite_command_and_a_known_rule(healths):
     """And never a faster one than without it."""
@@ -223,6 +224,7 @@ def test_any_health_gives_a_finite_command_and_a_known_rule(healths):
         assert math.hypot(sent.velocity.x, sent.velocity.y) <= math.hypot(free.velocity.x, free.velocity.y) + 1e-9
 
 
+@settings(deadline=None)
 @given(st.floats(-1e5, 1e5))
 def test_shift_of_the_clock_changes_nothing(shift):
     """Must-have: only differences of times count."""

@@ -162,6 +162,7 @@ def test_mask_ends_with_what_caused_it():
         assert (monitor.masked(one, []) is one) == (k <= 10 or not near)
 
 
+@settings(deadline=None)
 @given(st.lists(st.floats(0.0, 5.0, width=32), min_size=40, max_size=40), st.floats(0.0, 1.0))
 def test_masking_only_ever_forgets_what_is_inside_the_hull(near, speed):
     """Whatever the scans show: a beam that is not inside the hull keeps its range, and nothing becomes free."""
