@@ -46,6 +46,8 @@ log = logging.getLogger("flight.link")
 COMMAND_DEADLINE_S = 3.0
 MODE_DEADLINE_S = 3.0
 POLL_S = 0.01
+REPORT_RATE_HZ = 10.0
+"""Of what the autopilot says about itself: often enough for the safety layer's bounds."""
 OWN_SYSTEM_ID = 245
 OWN_COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 LOOPBACK_HOSTS = ("127.0.0.1", "localhost", "::1")
@@ -204,6 +206,8 @@ class VehicleLink:
         """Ask for the messages the loop lives on at `rate_hz`. Raises `VehicleCommandError` when PX4 refuses."""
         for name in ("LOCAL_POSITION_NED", "ATTITUDE", "HIGHRES_IMU"):
             self.request_message_rate(name, rate_hz)
+        for name in ("ODOMETRY", "ESTIMATOR_STATUS", "POSITION_TARGET_LOCAL_NED"):
+            self.request_message_rate(name, REPORT_RATE_HZ)
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float, keep_alive: Callable[[], None] | None = None) -> bool:
         """Poll `condition` every 10 ms until it holds (True) or `timeout_s` passed (False)."""

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 from flight.authority import Authority
 from flight.errors import ExitCode, VehicleCommandError
+from flight.health import health_of
 from flight.interrupt import Interrupt
 from flight.lidar.driver import LidarDriver
 from flight.link import VehicleLink
@@ -79,7 +80,7 @@ class OffboardFlight:
         self._link, self._lidar, self._pilot, self._frame = link, lidar, pilot, frame
         self._mission, self._interrupt, self._status, self._clock = mission, interrupt, status, clock
         self._sent_s = -math.inf
-        self._engaged = False
+        self._engaged = self._overruled = False
         self._loss_certain_s = LOSS_CERTAINTY * mission.failsafe.setpoint_loss_timeout_s
         self._judge = FlightJudge(mission)
         self._recorder = recorder if recorder is not None else NoRecorder()
@@ -151,8 +152,12 @@ class OffboardFlight:
         if now_s - self._sent_s > self._mission.failsafe.stall_s:
             return self._after_stall(now_s)
         scan, state = self._lidar.latest(), self._link.state(self._frame)
-        decided = record = self._pilot.tick(scan, state, now_s)
-        if self._judge.pausing(record) and record.sent != STILL:
+        health = health_of(
+            self._link.telemetry, self._frame, self.keeper.lateness_s, self._link.authority, overruled=self._overruled
+        )
+        decided = record = self._pilot.tick(scan, state, now_s, health)
+        self._overruled = self._judge.pausing(record) and record.sent != STILL
+        if self._overruled:
             record = replace(record, sent=STILL)
         if self._clock() - self._sent_s > self._loss_certain_s:  # held up since the tick began
             self._record(decided, scan, state, None)
@@ -179,6 +184,7 @@ class OffboardFlight:
         setpoint would throw it back into OFFBOARD.
         """
         stalled_s = now_s - self._sent_s
+        self._overruled = True
         self.events.append(f"loop stalled for {stalled_s:.2f} s")
         if stalled_s > self._loss_certain_s:
             action = self._mission.failsafe.setpoint_loss_action
@@ -235,8 +241,11 @@ class FlightJudge:
             self._started_s = self._best_s = record.now_s
         if record.goal_reached:
             return Ending("goal_reached", ExitCode.GOAL_REACHED, f"goal reached ({record.distance_to_goal_m:.2f} m)")
+        cause = self.escalation.cause
+        if self.escalation.level == Level.YIELD:
+            message = f"safety gave up control ({cause}): the stream stops, PX4 or the pilot has the vehicle"
+            return Ending("safety", ExitCode.SAFETY_ENDED, message, in_control=False)
         if self.escalation.level >= Level.HOLD:
-            cause = self.escalation.cause
             return Ending("safety", ExitCode.SAFETY_ENDED, f"safety ended the flight ({cause}): holding, then landing")
         return self._late(record)
 
