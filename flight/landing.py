@@ -72,6 +72,9 @@ class Landing:
         while self._clock() < deadline:
             if self._link.telemetry.armed is False:
                 return True
+            if self._link.guard.lost is not None:
+                self.events.append(self._link.guard.lost)
+                return False
             if self._interrupt.count > max(signals, 1):
                 self.events.append("not waited for: PX4 is landing")
                 return False

@@ -19,6 +19,7 @@ import numpy as np
 from flight.authority import Authority, ControlLostError
 from flight.errors import ExitCode, MissionError, RefusedError, VehicleCommandError
 from flight.gateway_process import GatewayProcess, GatewayReady
+from flight.guard.client import GuardLostError
 from flight.interrupt import Interrupt
 from flight.landing import Landing
 from flight.lidar import LidarDriver, body_motion, open_lidar
@@ -102,7 +103,8 @@ class FlightSession:
             self._start_gateway(stack)
             place = self._place()
             lidar = stack.enter_context(open_lidar(lidar_source(self._mission)))
-            link = stack.enter_context(VehicleLink(vehicle_url(self._mission)))
+            fifo = self._mission.realtime.fifo_priority
+            link = stack.enter_context(VehicleLink(vehicle_url(self._mission), guard_priority=fifo + 1 if fifo else 0))
             self._connect(link, lidar)
             self._preflight(link, lidar, policy, place)
             frame = self._anchor(link, place)
@@ -232,19 +234,24 @@ class FlightSession:
             ending = self._take_off(link, frame) or self._engage_and_run(flight)
         except ControlLostError as error:
             ending = Ending(_outcome(link), ExitCode.NOT_REACHED, str(error), in_control=False)
+        except GuardLostError as error:
+            ending = Ending("guard_lost", ExitCode.SAFETY_ENDED, str(error), in_control=False)
         except VehicleCommandError as error:
             ending = Ending("vehicle_refused", ExitCode.NOT_REACHED, str(error))
         except Exception as error:  # armed: whatever it is, the vehicle must come down
             log.exception("unexpected error in flight")
             ending = Ending("internal_error", ExitCode.SAFETY_ENDED, f"{type(error).__name__}: {error}")
-        self._status.phase(ending.message)
         if not (ending.in_control and link.in_control):
+            link.close_stream()
+            self._status.phase(ending.message)
             self._events += flight.events
             return ending, link.telemetry.armed is False
+        self._status.phase(ending.message)
         if link.mode == FlightMode.OFFBOARD:
             flight.brake(BRAKE_S)
         landing = Landing(link, self._status, self._interrupt, self._mission.timeouts.land_s)
         landed = landing.land(flight.stay if link.mode == FlightMode.OFFBOARD else None)
+        link.close_stream()
         self._events += [*flight.events, *landing.events]
         return ending, landed
 
@@ -259,6 +266,8 @@ class FlightSession:
                 return
             except ControlLostError as error:
                 raise RefusedError(f"not armed: {error}") from None
+            except GuardLostError as error:
+                raise RefusedError(f"{error}; look whether the vehicle is armed") from None
             except VehicleCommandError as error:
                 if link.armed:
                     return
@@ -277,8 +286,7 @@ class FlightSession:
         while time.monotonic() < deadline:
             if self._interrupt.requested:
                 return Ending("stopped", ExitCode.NOT_REACHED, f"stopped by {self._interrupt.name} during takeoff: landing")
-            if not link.in_control:
-                raise ControlLostError(link.authority.lost if link.authority is not None else None)
+            link.require_control()
             if link.mode == FlightMode.TAKEOFF:
                 climbing = True
             elif climbing and self._stopped_early(link, frame):
