@@ -18,11 +18,8 @@ from dataclasses import dataclass, replace
 
 from flight.authority import Authority
 from flight.errors import ExitCode, VehicleCommandError
-<<<<<<< HEAD
-from flight.health import health_of
-=======
 from flight.guard.core import Reason
->>>>>>> s2-guard
+from flight.health import health_of
 from flight.interrupt import Interrupt
 from flight.lidar.driver import LidarDriver
 from flight.link import VehicleLink
@@ -85,11 +82,7 @@ class OffboardFlight:
         self._link, self._lidar, self._pilot, self._frame = link, lidar, pilot, frame
         self._mission, self._interrupt, self._status, self._clock = mission, interrupt, status, clock
         self._sent_s = -math.inf
-<<<<<<< HEAD
-        self._engaged = self._overruled = False
-        self._loss_certain_s = LOSS_CERTAINTY * mission.failsafe.setpoint_loss_timeout_s
-=======
->>>>>>> s2-guard
+        self._overruled = False
         self._judge = FlightJudge(mission)
         self._recorder = recorder if recorder is not None else NoRecorder()
 
@@ -191,25 +184,10 @@ class OffboardFlight:
         self._recorder.tick(decided, scan, state, sent, sent_s, self._pilot.goal, keeper.lateness_s, keeper.deadline_misses)
 
     def _after_stall(self, now_s: float) -> Ending | None:
-<<<<<<< HEAD
-        """The loop was held up: brake first, and look again in the next tick with samples that arrived since.
-
-        After a stall as long as PX4's loss timeout nothing is sent: PX4 has taken over, or is about to, and a single
-        setpoint would throw it back into OFFBOARD.
-        """
-        stalled_s = now_s - self._sent_s
-        self._overruled = True
-        self.events.append(f"loop stalled for {stalled_s:.2f} s")
-        if stalled_s > self._loss_certain_s:
-            action = self._mission.failsafe.setpoint_loss_action
-            message = f"the loop stood still for {stalled_s:.1f} s: PX4's own loss action ({action}) has the vehicle now"
-            return Ending("loop_stalled", ExitCode.SAFETY_ENDED, message, in_control=False)
-        self._sent_s = self._link.send_velocity(STILL, self._frame)
-=======
         """The loop was held up: brake first, and look again in the next tick with samples that arrived since."""
+        self._overruled = True
         self.events.append(f"loop stalled for {now_s - self._sent_s:.2f} s")
         self._stand_still()
->>>>>>> s2-guard
         self.stall_times_s.append(now_s)
         recent = [time_s for time_s in self.stall_times_s[-MAX_STALLS:] if now_s - time_s < STALL_WINDOW_S]
         if len(recent) < MAX_STALLS:
