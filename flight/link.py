@@ -64,7 +64,14 @@ class VehicleLink:
     arming and takeoff raises `ControlLostError` before anything is sent.
     """
 
-    def __init__(self, url: str, clock: Callable[[], float] = time.monotonic, *, guard_priority: int = 0) -> None:
+    def __init__(
+        self,
+        url: str,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        guard_priority: int = 0,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
         """`guard_priority`: SCHED_FIFO priority of the guard where it is permitted, 0 for usual scheduling."""
         self.url = url
         self.guard = SetpointGuard(url, guard_priority)
@@ -73,7 +80,7 @@ class VehicleLink:
         self.system_id = 0
         self.setpoints_sent = 0
         self.authority: Authority | None = None
-        self._clock = clock
+        self._clock, self._sleep = clock, sleep
         self._mavsdk: Any = None
         self._direct: Any = None
         self._action: Any = None
@@ -223,7 +230,7 @@ class VehicleLink:
                 raise GuardLostError(self.guard.lost)
             if keep_alive is not None:
                 keep_alive()
-            time.sleep(POLL_S)
+            self._sleep(POLL_S)
         return True
 
     # -- setpoints ----------------------------------------------------------------------------------------------

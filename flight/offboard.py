@@ -73,14 +73,17 @@ class OffboardFlight:
         status: Status,
         clock: Callable[[], float] = time.monotonic,
         recorder: FlightRecorder | None = None,
+        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
+        """`clock`, `sleep`: seconds of one monotonic clock; campaigns give those of simulated time."""
         self.log = FlightLog(max_ticks=int(mission.timeouts.flight_s * LOOP_RATE_HZ) + 200)
         self.log.reserve()
-        self.keeper = RateKeeper(LOOP_RATE_HZ, clock)
+        self.keeper = RateKeeper(LOOP_RATE_HZ, clock, sleep)
         self.events: list[str] = []
         self.stall_times_s: list[float] = []
         self._link, self._lidar, self._pilot, self._frame = link, lidar, pilot, frame
         self._mission, self._interrupt, self._status, self._clock = mission, interrupt, status, clock
+        self._sleep = sleep
         self._sent_s = -math.inf
         self._overruled = False
         self._judge = FlightJudge(mission)
@@ -98,7 +101,7 @@ class OffboardFlight:
         deadline = self._clock() + SETPOINTS_BEFORE_OFFBOARD_S
         while self._clock() < deadline:
             self.stay()
-            time.sleep(0.01)
+            self._sleep(0.01)
         self._pilot.reset()
         self._link.set_mode(FlightMode.OFFBOARD, keep_alive=self.stay)
 
@@ -145,7 +148,7 @@ class OffboardFlight:
                 due_s = min(due_s, phase_s)
         scan = self._lidar.latest()
         if scan is not None and math.isfinite(due_s):
-            time.sleep((scan.time_s + due_s - self._clock()) % (1.0 / LOOP_RATE_HZ))
+            self._sleep((scan.time_s + due_s - self._clock()) % (1.0 / LOOP_RATE_HZ))
         self.keeper.reset()
 
     def _step(self) -> Ending | None:
@@ -232,7 +235,7 @@ class OffboardFlight:
         try:
             while self._clock() < deadline and self._link.in_control and self._link.mode == FlightMode.OFFBOARD:
                 self.stay()
-                time.sleep(0.01)
+                self._sleep(0.01)
         except VehicleCommandError as error:
             self.events.append(str(error))
 

@@ -295,6 +295,11 @@ class Simulation:
         )
 
     @property
+    def truth_position_m(self) -> Point:
+        """Where the vehicle really is."""
+        return _triple(self._state[POS : POS + 3])
+
+    @property
     def landed(self) -> bool:
         """Whether the vehicle rests on the ground."""
         return bool(self._state[LANDED] > 0.0)
