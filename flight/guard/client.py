@@ -43,7 +43,7 @@ class GuardLostError(VehicleCommandError):
 
 
 class SetpointGuard:
-    """A running guard. Context manager: leaving it ends the guard without another setpoint.
+    """A running guard. Context manager: leaving it ends the guard.
 
     `url` is the vehicle's; MAVSDK connects to `relay_url` once `start` has returned. `fifo_priority`: of the guard's process, 0 for usual.
     """
@@ -190,8 +190,7 @@ class SetpointGuard:
     # -- the end
 
     def close(self) -> None:
-        """Silence, end of the relay, process reaped; killed where it does not end by itself. Idempotent."""
-        self.disengage()
+        """End of the relay, process reaped, killed where it does not end by itself. An engagement still open is braked. Idempotent."""
         control, self._control = self._control, None
         if control is not None:
             control.close()
