@@ -2,9 +2,10 @@
 
     python -m campaigns.process_death --repeats 3 --pauses 20 --out results/process_death.json
 
-Each run is the real `fly` with its guard against the gateway, in processes of their own and in real time. At full speed one of them is
-hung, stopped, killed or silenced. Counted are the setpoints that arrive at the vehicle's side of the wire, by a relay of this campaign
-with its own clock; whether the vehicle braked, touched nothing and ended in good hands says the simulator's truth.
+Each run is the real `fly` with its guard against the gateway, in processes of their own and in real time. At full speed one of
+them is hung, stopped, killed or silenced. Counted are the setpoints that arrive at the vehicle's side of the wire, by a relay
+of this campaign with its own clock; whether the vehicle braked, touched nothing and ended in good hands says the simulator's
+truth.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ safety:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One fault of one process. `resume_s`: after which a stopped process goes on. `bound_s`: no moving setpoint later than this."""
+    """One fault of one process. `resume_s`: when a stopped process goes on. `bound_s`: no moving setpoint later than this."""
 
     process: str
     fault: str
@@ -342,8 +343,19 @@ def _largest(runs: list[Run], value: Callable[[Run], float | None]) -> float | N
 
 def markdown(result: dict[str, Any]) -> str:
     """The matrix as a table."""
-    head = "| process | fault | runs | moving setpoints too late | last moving | first zero | left OFFBOARD | way, m | contacts | ended |"
-    lines = [head, "|" + "---|" * 10]
+    names = (
+        "process",
+        "fault",
+        "runs",
+        "moving too late",
+        "last moving",
+        "first zero",
+        "left OFFBOARD",
+        "way, m",
+        "contacts",
+        "ended",
+    )
+    lines = [f"| {' | '.join(names)} |", "|" + "---|" * len(names)]
     for cell in result["process_death"]:
         times = [_milliseconds(cell[f"{key}_s_max"]) for key in ("last_moving", "first_still", "left_offboard")]
         ended = ", ".join(f"{count} {how}" for how, count in cell["ended"].items())

@@ -1,4 +1,4 @@
-"""Recording relays between `fly` and the vehicle: what reached the autopilot's side of the wire and when, independently of both ends."""
+"""Recording relays between `fly` and the vehicle: what reached the autopilot's side of the wire, and when."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class _Relay:
 
 
 class WireTap(_Relay):
-    """UDP: gateway <-> tap <-> `fly`. `mute` drops everything from the vehicle. Bytes are only stored here; `setpoints` reads them later."""
+    """UDP: gateway <-> tap <-> `fly`. `mute` drops all from the vehicle. Bytes are only stored, and read when asked for."""
 
     def __init__(self, gateway_port: int, fly_port: int) -> None:
         super().__init__()
@@ -106,7 +106,9 @@ class WireTap(_Relay):
     def setpoints(self) -> list[Setpoint]:
         """Every setpoint that passed so far, oldest first."""
         return [
-            Setpoint(time_s, math.hypot(m.vx, m.vy, m.vz) if m.get_msgId() == SETPOINT else math.inf, abs(getattr(m, "yaw_rate", 0.0)))
+            Setpoint(
+                time_s, math.hypot(m.vx, m.vy, m.vz) if m.get_msgId() == SETPOINT else math.inf, abs(getattr(m, "yaw_rate", 0.0))
+            )
             for time_s, m in _messages(tuple(self._up))
             if m.get_msgId() in STEERING
         ]
@@ -141,7 +143,7 @@ def _messages(datagrams: tuple[tuple[float, bytes], ...]) -> list[tuple[float, A
 
 
 class ByteTap(_Relay):
-    """TCP: one client at a time is joined to `target_port`. `mute` drops what comes from there: a LiDAR that says nothing more."""
+    """TCP: one client at a time is joined to `target_port`. `mute` drops what comes from there: a LiDAR gone silent."""
 
     def __init__(self, target_port: int) -> None:
         super().__init__()
