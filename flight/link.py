@@ -1,8 +1,9 @@
 """The vehicle over MAVSDK: telemetry in, one-shot velocity setpoints and commands with deadlines out.
 
-The wire belongs to a process of its own, the guard (`flight.guard`): MAVSDK talks through it, and setpoints go to it, not to MAVSDK.
-The guard sends each one once, only while it is young; when this program stops, hangs or dies, it brakes and falls silent, so that
-PX4's own offboard-loss action comes. MAVSDK's Offboard plugin is never used: it repeats the last setpoint by itself for ever.
+The wire belongs to a process of its own, the guard (`flight.guard`): MAVSDK talks through it, and setpoints go to it, not to
+MAVSDK. The guard sends each one once, only while it is young; when this program stops, hangs or dies, it brakes and falls
+silent, so that PX4's own offboard-loss action comes. MAVSDK's Offboard plugin is never used: it repeats the last setpoint by
+itself for ever.
 
 Everything MAVSDK calls back arrives on its own thread and only replaces the newest sample (`flight.telemetry`).
 """
@@ -247,7 +248,7 @@ class VehicleLink:
     def send_velocity(self, command: SafeCommand, frame: CorridorFrame, decided_s: float | None = None) -> float | None:
         """Send one velocity setpoint; returns when it went out, None where the guard held it back (too old, stream closed).
 
-        `decided_s`: when the inputs were read that led to it, now if not given; the guard sends nothing that was decided too long ago.
+        `decided_s`: when the inputs were read that led to it, now if not given; the guard sends nothing decided too long ago.
         The last gate before the wire: raises `ValueError` on a number that is not finite, `ControlLostError` when the vehicle is
         not ours any more, `GuardLostError` when the guard is gone.
         """

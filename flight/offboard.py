@@ -1,9 +1,9 @@
 """OFFBOARD: the handshake, the 20 Hz loop, and every reason for which it ends.
 
-Liveness by construction: each setpoint is handed to the guard (`flight.guard`) with the time at which it was decided, and goes out once
-or never. When the loop stalls, is stopped or killed, the guard brakes and falls silent, and PX4's own loss action (set and read back
-in preflight) takes over. A loop that comes back while the guard brakes sends zero velocity first, then flies on with fresh samples;
-missed ticks are not made up for. Once the guard is silent, the flight is over.
+Liveness by construction: each setpoint is handed to the guard (`flight.guard`) with the time at which it was decided, and goes
+out once or never. When the loop stalls, is stopped or killed, the guard brakes and falls silent, and PX4's own loss action (set
+and read back in preflight) takes over. A loop that comes back while the guard brakes sends zero velocity first, then flies on
+with fresh samples; missed ticks are not made up for. Once the guard is silent, the flight is over.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ class OffboardFlight:
             return None
         if guard.reason is Reason.MISSED_BEAT:
             stalled_s, action = now_s - self._sent_s, self._mission.failsafe.setpoint_loss_action
-            message = f"the loop stood still for {stalled_s:.1f} s: the guard has braked, PX4's own loss action ({action}) follows"
+            message = f"the loop stood still for {stalled_s:.1f} s: the guard braked, PX4's own loss action ({action}) follows"
             return Ending("loop_stalled", ExitCode.SAFETY_ENDED, message, in_control=False)
         self._link.wait_until(lambda: not self._link.in_control, MODE_REPORT_S)  # the guard reads the mode before MAVSDK does
         authority = self._link.authority

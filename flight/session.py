@@ -30,7 +30,6 @@ from flight.mission import Mission
 from flight.offboard import Ending, OffboardFlight
 from flight.preflight import (
     LOOP_RATE_HZ,
-    Check,
     Level,
     check_goal_clear,
     check_lidar,
@@ -54,6 +53,7 @@ from flight.realtime import real_time
 from flight.recording_setup import FlightRecording, flight_header, record_flight
 from flight.report import write_report
 from flight.results import FlightResult, judge_flight, true_distance_m, truth_from_report, write_log
+from flight.setpoint_loss import set_loss_action
 from flight.shadow import ShadowFlight
 from flight.status import Status
 from flight.summary import build_summary, write_json_atomic
@@ -196,20 +196,9 @@ class FlightSession:
             checks += check_start(place.takeoff_point, mission.takeoff_height_m, self._ready.boxes, mission.safety)
             checks += check_goal_clear(place.goal, self._ready.boxes, mission.safety)
         if not self._shadow and all(check.level is not Level.FAIL for check in checks):
-            checks.append(self._set_loss_action(link))
+            checks.append(set_loss_action(link, mission))
         self._status.checks(checks)
         require(checks)
-
-    def _set_loss_action(self, link: VehicleLink) -> Check:
-        """PX4's reaction to a stream that stops: written, and read back from the vehicle."""
-        failsafe = self._mission.failsafe
-        seen = f"{failsafe.setpoint_loss_action} after {failsafe.setpoint_loss_timeout_s:g} s"
-        try:
-            link.set_parameter("COM_OF_LOSS_T", failsafe.setpoint_loss_timeout_s)
-            link.set_parameter("COM_OBL_RC_ACT", int(failsafe.loss_action))
-        except VehicleCommandError as error:
-            return Check("setpoint loss", Level.FAIL, str(error), "fly engages only when PX4's own failsafe is known")
-        return Check("setpoint loss", Level.PASS, seen)
 
     def _anchor(self, link: VehicleLink, place: Place) -> CorridorFrame:
         """The corridor frame through the spot where the vehicle stands."""

@@ -1,7 +1,7 @@
 """One factor on the speed limits for assumptions that weaken in flight: old data, a late loop, a slow link, weak braking.
 
-All delays beyond their nominal value add to the total blind time T; speed is then limited to what makes v T no longer than assumed.
-The factor is exactly 1 while everything is nominal, so that nothing changes, bit for bit.
+All delays beyond their nominal value add to the total blind time T; speed is then limited to what makes v T no longer than
+assumed. The factor is exactly 1 while everything is nominal, so that nothing changes, bit for bit.
 """
 
 from __future__ import annotations

@@ -105,9 +105,10 @@ class EstimateMonitor:
         oldest = drift[0]
         if oldest[0] > begin:
             return
-        moved = math.dist(newest[1:], oldest[1:])
-        if moved > config.velocity_mismatch_m_s * (newest[0] - oldest[0]):
-            found.append(Intervention("velocity_mismatch", moved / (newest[0] - oldest[0]), config.velocity_mismatch_m_s))
+        span_s = newest[0] - oldest[0]
+        across, up = math.dist(newest[1:3], oldest[1:3]) / span_s, abs(newest[3] - oldest[3]) / span_s
+        if max(across, up) > config.velocity_mismatch_m_s:
+            found.append(Intervention("velocity_mismatch", max(across, up), config.velocity_mismatch_m_s))
 
     def _judge_frozen(self, last: VehicleState, state: VehicleState, commanded_m_s: float, found: list[Intervention]) -> None:
         """E2: the same position and velocity in every bit, under fresh stamps, while motion is commanded."""

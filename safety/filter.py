@@ -93,9 +93,10 @@ class SafetyFilter:
             sent, verdict = _braked(*(judged.faults or (Intervention("input_missing", math.nan, math.nan),)))
         else:
             sent, verdict = self._steer(command, state, judged.scan, now_s, judged)
-        interventions = verdict.interventions + judged.notices
-        ages = {"scan_age_s": _age(scan, now_s), "state_age_s": _age(state, now_s)}
-        return sent, dataclasses.replace(verdict, interventions=interventions, **ages)
+        told = verdict.interventions + judged.notices
+        return sent, dataclasses.replace(
+            verdict, interventions=told, scan_age_s=_age(scan, now_s), state_age_s=_age(state, now_s)
+        )
 
     def _steer(
         self, command: VelocityCommand, state: VehicleState, scan: LidarScan, now_s: float, judged: Judgement

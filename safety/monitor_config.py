@@ -18,8 +18,8 @@ class MonitorConfig(BaseModel):
 
     position_jump_m: Positive = Field(0.25, description="E1: horizontal step of the position that velocity does not explain")
     altitude_jump_m: Positive = Field(0.25, description="E9: the same, vertically")
-    velocity_mismatch_m_s: Positive = Field(1.5, description="E6: mean difference of velocity and change of position")
-    velocity_window_s: Positive = Field(0.3, description="E6: time over which that mean is taken")
+    velocity_mismatch_m_s: Positive = Field(1.6, description="E6: mean difference of velocity and change of position")
+    velocity_window_s: Positive = Field(0.4, description="E6: time over which that mean is taken")
     jumps_window_s: Positive = Field(5.0, description="E1: a second jump within this time makes HOLD")
     frozen_state_s: Positive = Field(0.2, description="E2: position and velocity may stay the same in every bit this long")
     frozen_command_m_s: Positive = Field(0.3, description="E2: while at least this speed is commanded")

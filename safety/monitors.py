@@ -215,10 +215,14 @@ class InputMonitor:
         self._walled = near >= WALL_SHARE
         return None
 
+    def _shows_something(self, scan: LidarScan) -> bool:
+        """Whether there is a return from outside the vehicle: parts of itself look the same for ever."""
+        return bool((np.isfinite(scan.ranges_m) & (scan.ranges_m > self._config.vehicle_radius_m)).any())
+
     def _frozen_fault(self, scan: LidarScan, state: VehicleState | None) -> Intervention | None:
         """Bit-identical scans with new stamps while the vehicle moves (L2). Empty scans are alike by right."""
         if scan.time_s > self._scan_time_s:
-            same = self._ranges is not None and np.array_equal(scan.ranges_m, self._ranges) and np.isfinite(scan.ranges_m).any()
+            same = self._ranges is not None and np.array_equal(scan.ranges_m, self._ranges) and self._shows_something(scan)
             self._frozen = self._frozen + 1 if same else 0
             self._ranges = scan.ranges_m.copy()
             self._scan_time_s = scan.time_s

@@ -65,7 +65,7 @@ _TABLE = (
     Reaction("estimate_jump_again", Level.HOLD, ("E1",), TICK_S),
     Reaction("altitude_jump", Level.HOLD, ("E9",), TICK_S),
     Reaction("estimate_frozen", Level.BRAKE, ("E2",), 0.35),
-    Reaction("velocity_mismatch", Level.BRAKE, ("E6",), 0.4),
+    Reaction("velocity_mismatch", Level.BRAKE, ("E6",), 0.5),
     Reaction("motion_direction", Level.HOLD, ("E7",), 1.5),
     Reaction("estimate_reset", Level.HOLD, ("E8",), TICK_S),
     Reaction("estimate_invalid", Level.LAND, ("E11",), 0.2),

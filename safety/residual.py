@@ -18,7 +18,7 @@ from safety.messages import Intervention, VehicleState
 SAMPLES = 64
 LEAST_SPEED_M_S = 0.2  # slower than this, noise decides in which direction the vehicle brakes
 LEAST_CHANGE_M_S = 0.1  # expected slowing down that says something
-EVIDENCE = 0.05  # (m/s)^2 s of expected slowing down before the share is believed: one stop from about 0.8 m/s
+EVIDENCE = 0.08  # (m/s)^2 s of expected slowing down before the share is believed: one stop from about 1 m/s
 SHARE_MOST = 2.0
 ROUNDING_S = 1e-6
 

@@ -1,4 +1,4 @@
-"""What loop and guard say to each other: small fixed messages over a SOCK_SEQPACKET pair, whose end tells that the other is gone."""
+"""What loop and guard say to each other: small fixed messages over a SOCK_SEQPACKET pair. Its end tells that one is gone."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ from flight.guard.core import Command, Reason, State, Velocity
 ROOT = Path(__file__).resolve().parents[2]
 ANSWER_WAIT_S = 0.005
 MAX_UNANSWERED = 3
-"""Commands in a row without an answer before the guard counts as hung: 150 ms at 20 Hz. A pause of this process is no such row."""
+"""Commands in a row without an answer before the guard counts as hung: 150 ms at 20 Hz. A pause of `fly` is no such row."""
 
 ENGAGE_DEADLINE_S = 1.0
 STOP_DEADLINE_S = 1.0
@@ -43,9 +43,9 @@ class GuardLostError(VehicleCommandError):
 
 
 class SetpointGuard:
-    """A running guard. Context manager: leaving it ends the guard without another setpoint.
+    """A running guard. Context manager: leaving it ends the guard.
 
-    `url` is the vehicle's; MAVSDK connects to `relay_url` once `start` has returned. `fifo_priority`: of the guard's process, 0 for usual.
+    `url` is the vehicle's; MAVSDK connects to `relay_url` once `start` has returned. `fifo_priority`: the guard's, 0 for usual.
     """
 
     def __init__(self, url: str, fifo_priority: int = 0) -> None:
@@ -67,7 +67,7 @@ class SetpointGuard:
         self.close()
 
     def start(self, timeout_s: float, keep_waiting: Callable[[], None] | None = None) -> None:
-        """Start the guard and wait until the wire is open. Raises `RefusedError` with its reason, `NoVehicleError` after `timeout_s`."""
+        """Start it and wait until the wire is open. Raises `RefusedError` with the reason, `NoVehicleError` after `timeout_s`."""
         own, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with other:
             self._child = subprocess.Popen(
@@ -190,8 +190,7 @@ class SetpointGuard:
     # -- the end
 
     def close(self) -> None:
-        """Silence, end of the relay, process reaped; killed where it does not end by itself. Idempotent."""
-        self.disengage()
+        """End the relay and the process, by force where need be. An engagement still open is braked first. Idempotent."""
         control, self._control = self._control, None
         if control is not None:
             control.close()

@@ -3,9 +3,9 @@
     IDLE --engage--> FOLLOW --no fresh command for beat_s--> BRAKE --brake_s later--> SILENT
                        ^---------- a fresh command ------------'
 
-FOLLOW sends each command at once, one message per command, only while it is young. BRAKE sends zero velocity. SILENT is final until
-the next `engage`, which only a new engagement of OFFBOARD does. Any sign that the vehicle is no longer ours (its own mode report,
-the loop's `disengage`) leads to silence directly, without a braking message: pilot first.
+FOLLOW sends each command at once, one message per command, only while it is young. BRAKE sends zero velocity. SILENT is final
+until the next `engage`, which only a new engagement of OFFBOARD does. Any sign that the vehicle is no longer ours (its own mode
+report, the loop's `disengage`) leads to silence directly, without a braking message: pilot first.
 
 Times are seconds of one monotonic clock. A guard that was itself held up finds its deadlines passed and skips what it missed.
 """
@@ -56,7 +56,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One setpoint of the loop: velocity north, east, down (m/s) and yaw rate (rad/s, clockwise); `stamp_s`: when it was decided."""
+    """One setpoint: velocity north, east, down (m/s) and yaw rate (rad/s, clockwise); `stamp_s`: when the loop decided it."""
 
     engagement: int
     sequence: int

@@ -1,7 +1,7 @@
 """The wire to the autopilot: UDP, TCP or a serial line, from MAVSDK's URLs. Nothing here blocks once it is open.
 
-A port hands over whole frames and takes whole frames. A setpoint (`urgent`) never waits anywhere: where the wire is still busy with
-what went before, it is dropped rather than delivered late.
+A port hands over whole frames and takes whole frames. A setpoint (`urgent`) never waits anywhere: where the wire is still busy
+with what went before, it is dropped rather than delivered late.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ import socket
 import struct
 import termios
 from collections import deque
-from typing import Protocol
+from typing import Any, Protocol
 from urllib.parse import urlsplit
 
 from flight.guard.wire import FrameStream, read_frames, read_mode
 
+Address = tuple[Any, ...]
 CHUNK_BYTES = 4096
 MAX_WAITING_FRAMES = 64
 MAX_UNSENT_BYTES = 512
@@ -29,8 +30,6 @@ class PortError(Exception):
 
 class Port(Protocol):
     """One wire to one autopilot."""
-
-    peer: object | None
 
     def fileno(self) -> int:
         """For `select`."""
@@ -50,12 +49,12 @@ class Port(Protocol):
 
 
 class UdpPort:
-    """UDP. A listening port takes as its peer the address from which an autopilot's heartbeat comes, and hears only that one then."""
+    """UDP. A listening port takes the address of the first autopilot's heartbeat as its peer, and hears only that one then."""
 
     def __init__(self, host: str, port: int, *, listen: bool) -> None:
         family, _, _, _, address = _resolve(host, port, socket.SOCK_DGRAM)
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        self.peer: object | None = None if listen else address
+        self.peer: Address | None = None if listen else address
         try:
             if listen:
                 self._socket.bind(address)
@@ -77,7 +76,7 @@ class UdpPort:
             return []
         return [data]
 
-    def _adopt(self, data: bytes, sender: object) -> bool:
+    def _adopt(self, data: bytes, sender: Address) -> bool:
         """Take `sender` as the autopilot if it shows one's heartbeat and none is known; with none known, anybody is heard."""
         if self.peer is not None:
             return False
@@ -90,7 +89,7 @@ class UdpPort:
         if self.peer is None:
             return False
         try:
-            self._socket.sendto(frames, self.peer)  # type: ignore[arg-type]
+            self._socket.sendto(frames, self.peer)
         except OSError:
             return False
         return True
@@ -104,7 +103,6 @@ class StreamPort:
     """A serial line or a TCP connection."""
 
     def __init__(self, descriptor: int, owner: socket.socket | None = None) -> None:
-        self.peer: object | None = descriptor
         self._descriptor, self._owner = descriptor, owner
         self._stream = FrameStream()
         self._waiting: deque[bytes] = deque()
@@ -148,7 +146,7 @@ class StreamPort:
             self._waiting.popleft()
 
     def _write(self, data: bytes) -> int:
-        """How many bytes the kernel took. The rest of a setpoint is dropped: half a frame fails its checksum, a late one would not."""
+        """How many bytes the kernel took. A setpoint's rest is dropped: half a frame fails its checksum, a late one would not."""
         try:
             return os.write(self._descriptor, data)
         except BlockingIOError:
@@ -188,7 +186,7 @@ def open_port(url: str, timeout_s: float) -> Port:
     raise PortError(f"unknown kind of connection {parts.scheme}; give for example udpin://127.0.0.1:14540")
 
 
-def _resolve(host: str, port: int, kind: socket.SocketKind) -> tuple[int, int, int, str, tuple[object, ...]]:
+def _resolve(host: str, port: int, kind: socket.SocketKind) -> tuple[int, int, int, str, Address]:
     return socket.getaddrinfo(host, port, 0, kind)[0]
 
 

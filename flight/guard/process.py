@@ -1,7 +1,7 @@
 """The guard as a process: relays bytes between the autopilot and MAVSDK, and turns the loop's commands into setpoints.
 
-One thread, one `select`. In every turn time comes first, then the loop, then the vehicle, then MAVSDK, each in bounded portions, so that
-neither a flood from outside nor a backlog after a pause can hold up what matters.
+One thread, one `select`. In every turn time comes first, then the loop, then the vehicle, then MAVSDK, each in bounded
+portions, so that neither a flood from outside nor a backlog after a pause can hold up what matters.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 
 from flight.guard.channel import MAX_MESSAGE_BYTES, Answer, Engage, Kind, pack_answer, read_request
 from flight.guard.core import STILL, Command, GuardCore, State, Velocity
-from flight.guard.ports import CHUNK_BYTES, Port, PortError, open_port
+from flight.guard.ports import CHUNK_BYTES, Address, Port, PortError, open_port
 from flight.guard.wire import STEERING, pack_setpoint, read_frames, read_mode
 
 OWN_IDS = (245, 192)
@@ -41,7 +41,7 @@ class GuardProcess:
         self.core = GuardCore()
         self.dropped = 0
         self._control, self._port, self._relay, self._clock = control, port, relay, clock
-        self._mavsdk: object | None = None
+        self._mavsdk: Address | None = None
         self._target = (0, 0)
         self._frames = 0
         self._last = Answer(State.IDLE, self.core.reason, 0, 0, math.nan, 0)
@@ -171,7 +171,7 @@ class GuardProcess:
     def _to_mavsdk(self, data: bytes) -> None:
         if self._mavsdk is not None:
             with contextlib.suppress(OSError):
-                self._relay.sendto(data, self._mavsdk)  # type: ignore[arg-type]
+                self._relay.sendto(data, self._mavsdk)
 
     def _from_mavsdk(self) -> None:
         for _ in range(PORTION):

@@ -1,7 +1,7 @@
 """The little MAVLink that the guard itself needs: one message out, frame boundaries, and the vehicle's mode in.
 
-Standard library only, like the whole guard: it must start at once, stay small, and import nothing that could hang it.
-Frame layouts: MAVLink 1 and 2 (mavlink.io/en/guide/serialization.html); checksum X.25 over all but the magic byte, plus CRC_EXTRA.
+Standard library only, like the whole guard: it must start at once, stay small, and import nothing that could hang it. Frame
+layouts: MAVLink 1 and 2 (mavlink.io/en/guide/serialization.html); checksum X.25 over all but the magic byte, plus CRC_EXTRA.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ MAX_FRAME_BYTES = 10 + 255 + 2 + SIGNATURE_BYTES
 HEARTBEAT, CURRENT_MODE, SET_POSITION_TARGET_LOCAL_NED = 0, 436, 84
 _CRC_EXTRA = {HEARTBEAT: 50, CURRENT_MODE: 193, SET_POSITION_TARGET_LOCAL_NED: 143}
 STEERING = frozenset({69, 70, 82, 84, 86, 139})
-"""MANUAL_CONTROL, RC_CHANNELS_OVERRIDE, SET_ATTITUDE_TARGET, SET_POSITION_TARGET_* and SET_ACTUATOR_CONTROL_TARGET: what steers."""
+"""What steers: MANUAL_CONTROL, RC_CHANNELS_OVERRIDE, SET_ATTITUDE_TARGET, SET_POSITION_TARGET_*, SET_ACTUATOR_CONTROL_TARGET."""
 
 _AUTOPILOT_COMPONENT = 1
 _AUTOPILOT_INVALID = 8
@@ -61,9 +61,14 @@ class Frame:
 
 
 def pack_setpoint(
-    sequence: int, time_boot_ms: int, source: tuple[int, int], target: tuple[int, int], velocity: tuple[float, ...], yaw_rate: float
+    sequence: int,
+    time_boot_ms: int,
+    source: tuple[int, int],
+    target: tuple[int, int],
+    velocity: tuple[float, ...],
+    yaw_rate: float,
 ) -> bytes:
-    """SET_POSITION_TARGET_LOCAL_NED, MAVLink 2: velocity north, east, down (m/s) and yaw rate (rad/s, clockwise), nothing else."""
+    """SET_POSITION_TARGET_LOCAL_NED, MAVLink 2: velocity north, east, down (m/s) and yaw rate (rad/s, clockwise)."""
     mask, none = _TYPE_MASK_VELOCITY_YAW_RATE, _NO_POSITION
     fields = (time_boot_ms & 0xFFFFFFFF, *none, *velocity, *none, 0.0, yaw_rate, mask, *target, _FRAME_LOCAL_NED)
     payload = _SETPOINT.pack(*fields)  # its last byte is not zero: nothing to truncate
@@ -73,7 +78,7 @@ def pack_setpoint(
 
 
 def read_frames(data: bytes) -> tuple[list[Frame], int]:
-    """The whole frames in `data`, bytes between them skipped; and how much of `data` is dealt with (the rest may be half a frame)."""
+    """The whole frames in `data`, other bytes skipped; and how much of `data` is dealt with (the rest may be half a frame)."""
     frames: list[Frame] = []
     at, size = 0, len(data)
     while at < size:
