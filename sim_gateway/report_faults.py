@@ -43,6 +43,9 @@ class ReportFaults:
             return replace(now, position=kept.position, velocity=kept.velocity)
         if item.kind == "report_stale" and name in _PLACE:
             return replace(now, position=kept.position, velocity=kept.velocity, time_s=kept.time_s)
+        if item.kind == "report_velocity":
+            north, east, down = now.velocity
+            return replace(now, velocity=(north + item["x_m_s"], east + item["y_m_s"], down + item["z_m_s"]))
         if item.kind == "report_backwards":
             return replace(now, time_s=now.time_s - item["step_s"])
         if item.kind == "report_clock":
@@ -63,8 +66,8 @@ class ReportFaults:
 def _alter(item: Active, name: str, message: Message) -> None:
     if item.kind == "report_nan" and name in ("LOCAL_POSITION_NED", "ODOMETRY"):
         message.x = message.vx = math.nan
-    elif item.kind == "report_attitude" and name == "ATTITUDE":
-        message.roll, message.yaw = item["roll_rad"], item["yaw_rad"]
+    elif item.kind == "report_attitude" and name in ("ATTITUDE", "ATTITUDE_QUATERNION"):
+        message.roll = message.pitch = message.yaw = message.q1 = math.nan
     elif item.kind == "report_reset" and name == "ODOMETRY":
         message.reset_counter = (message.reset_counter + 1) & 0xFF
     elif item.kind == "report_invalid" and name == "ESTIMATOR_STATUS":

@@ -274,9 +274,13 @@ class Simulation:
 
     def estimate(self) -> Motion:
         """What the vehicle believes: truth plus the estimate's errors. Reading twice at one time gives the same."""
-        noise = self._sensor_generator(_ACCELERATION_STREAM).standard_normal(3)
-        motion = self._motion(self._error, self._acceleration_sigma * noise)
+        motion = self._motion(self._error, self._acceleration_error())
         return self.motion_faults.estimate(motion) if self.motion_faults.any else motion
+
+    def _acceleration_error(self) -> Array:
+        if not self._acceleration_sigma.any():
+            return np.zeros(3)
+        return self._acceleration_sigma * self._sensor_generator(_ACCELERATION_STREAM).standard_normal(3)
 
     def _motion(self, error: Array, acceleration_error: Array) -> Motion:
         state = self._state

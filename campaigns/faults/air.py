@@ -24,7 +24,6 @@ from sim_gateway.scene import World
 from sim_gateway.scip_device import ScipDevice
 from sim_gateway.simulation import Simulation, step_at
 from sim_gateway.telemetry import ONBOARD, Telemetry
-from sim_gateway.vehicle import STEP_S
 
 DOWNLINK_S, UPLINK_S, SCAN_S = 0.004, 0.008, 0.016
 BOOTED_S = -20.0  # the autopilot has been on for a while
@@ -71,6 +70,7 @@ class Air:
         self.setpoints: list[Setpoint] = []
         self.modes: list[tuple[float, FlightMode, bool]] = []
         self.watch: Callable[[], None] = lambda: None
+        self.scan_times_s: list[float] = []
         self._scans = 0
         for fault in faults:
             self.simulation.inject(fault)
@@ -106,6 +106,7 @@ class Air:
 
     def _scan(self) -> None:
         self._scans += 1
+        self.scan_times_s.append(self.time_s)
         for scan in self.simulation.device_scans():
             data = self.device.new_scan(scan.time_s, self.device.geometry.sent_codes(scan.ranges_m))
             if data:
@@ -126,5 +127,3 @@ class Air:
             if isinstance(message, Garbage) or message.get_type() in STREAMED or message.get_type() == "COMMAND_ACK":
                 self.downlink.append((self.time_s + DOWNLINK_S, message))
 
-
-STEPS_PER_S = round(1.0 / STEP_S)

@@ -14,7 +14,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import development as mav
 
-from campaigns.faults.air import Air
+from campaigns.faults.air import DOWNLINK_S, Air
 from flight.guard.core import STILL, Command, GuardCore, Reason, State, Velocity
 from flight.guard.wire import ModeReport
 from flight.lidar.config import LidarSource
@@ -47,6 +47,8 @@ class Computer:
         self.now_s = CLOCK_OFFSET_S + air.time_s
         self.oversleep: Callable[[float], float] = lambda _now_s: 0.0
         self.frozen = False
+        self.heard_since_s = math.inf
+        self.first_heard_s: dict[str, float] = {}
         self.on_message: Callable[[str, int, str], None] = lambda *_: None
         self.every_step: list[Callable[[], None]] = []
 
@@ -85,12 +87,18 @@ class Computer:
             if isinstance(message, Garbage):
                 self.on_message("LOCAL_POSITION_NED", 1, message.data.decode("latin-1"))
             else:
+                self._note(message.get_type())
                 self.on_message(message.get_type(), message.get_srcComponent() or 1, fields_json(message))
+
+    def _note(self, name: str) -> None:
+        """When each kind of message, sent since the fault's begin, came first."""
+        if self.air.time_s - DOWNLINK_S >= self.heard_since_s:
+            self.first_heard_s.setdefault(name, self.air.time_s)
 
 
 def fields_json(message: Any) -> str:
-    """The fields as MAVSDK hands them over: JSON, in which what is not finite is null."""
-    fields = {name: getattr(message, name) for name in message.fieldnames}
+    """The fields as MAVSDK hands them over: JSON, in which what is not finite is null. Arrays are left out: nobody reads them."""
+    fields = {name: value for name in message.fieldnames if not isinstance(value := getattr(message, name), list)}
     text = fields.get("text")
     if isinstance(text, bytes):
         fields["text"] = text.decode("ascii", "replace")
@@ -180,7 +188,7 @@ class LockstepDirect:
         self._computer = computer
         self._packer = mav.MAVLink(None, srcSystem=OWN_SYSTEM_ID, srcComponent=OWN_COMPONENT_ID)
         self._waiting: list[tuple[int, Any, Callable[..., None], float, int]] = []
-        self.commands: list[tuple[float, int, float]] = []
+        self.commands: list[tuple[float, int, float, float]] = []
         computer.every_step.append(self._repeat)
 
     def send_message(self, message: tuple[str, str]) -> None:
@@ -191,7 +199,8 @@ class LockstepDirect:
     def send_command_async(self, message: tuple[str, str], on_ack: Callable[..., None]) -> None:
         """A command; `on_ack` is called with its final acknowledgement."""
         fields = json.loads(message[1])
-        self.commands.append((self._computer.air.time_s, int(fields["command"]), float(fields["param2"])))
+        numbers = (float(fields["param2"]), float(fields["param3"]))
+        self.commands.append((self._computer.air.time_s, int(fields["command"]), *numbers))
         self._pack(message[0], fields)
         self._waiting.append((int(fields["command"]), fields, on_ack, self._computer.now_s + RESEND_S, RESENDS))
 

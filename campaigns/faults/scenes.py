@@ -99,7 +99,7 @@ class WishfulPolicy:
         self.metadata = runner.metadata
         self.begun_s = math.inf
         self.upset: Callable[[NDArray[np.float32], float], NDArray[np.float32]] = lambda action, _time_s: action
-        self.norm_factor = 1.0
+        self.extra_norm = 0.0
         self._runner, self._scene, self._clock = runner, scene, clock
 
     @property
@@ -110,7 +110,11 @@ class WishfulPolicy:
     @property
     def hidden_norm(self) -> float:
         """Of the recurrent state."""
-        return self._runner.hidden_norm * self.norm_factor
+        return self._runner.hidden_norm + self.extra_norm
+
+    def poison(self) -> None:
+        """Put a NaN into the recurrent state."""
+        self._runner._states[self._runner._current][0] = np.nan
 
     def reset(self, reason: str = "offboard_entry") -> None:
         """Zero the recurrent state."""
