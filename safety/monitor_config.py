@@ -71,7 +71,7 @@ class MonitorConfig(BaseModel):
     braking_weak: Share = Field(0.9, description="A1: share of the expected slowing down from which on the cap falls")
     braking_healthy: Share = Field(1.0, description="A1: share from which on it rises again")
     braking_failed: Share = Field(0.7, description="V7: share that, lasting, makes LAND")
-    braking_failed_s: Positive = Field(1.0, description="V7: how long it may last")
+    braking_failed_s: Positive = Field(0.5, description="V7: time of braking, not of flying, for which it may last")
     cap_least: Share = Field(0.25, description="the cap never falls below this share of the speed limit: the way out stays open")
 
     @model_validator(mode="after")

@@ -166,12 +166,13 @@ class InputMonitor:
     ) -> None:
         """A command is missing by right where the samples were not fit to ask the policy."""
         fault = command_fault(command)
-        if fault is None and command is not None:
+        if fault is None:
+            assert command is not None  # judged in the line before
             self._policy.judge(command, now_s, notices)
-        elif fault is not None:
-            if not found:
-                self._policy.judge_bad(now_s, found)
-            found.append(fault)
+            return
+        if not found:
+            self._policy.judge_bad(now_s, found)
+        found.append(fault)
 
     def _cap(self, state: VehicleState | None, scan: LidarScan | None, now_s: float, health: Health) -> float:
         if state is None or scan is None:

@@ -67,7 +67,7 @@ _TABLE = (
     Reaction("estimate_frozen", Level.BRAKE, ("E2",), 0.35),
     Reaction("velocity_mismatch", Level.BRAKE, ("E6",), 0.5),
     Reaction("motion_direction", Level.HOLD, ("E7",), 1.5),
-    Reaction("estimate_reset", Level.HOLD, ("E8",), TICK_S),
+    Reaction("estimate_reset", Level.HOLD, ("E8",), 0.2),
     Reaction("estimate_invalid", Level.LAND, ("E11",), 0.2),
     Reaction("estimate_inaccurate", Level.HOLD, ("E5",), 1.2),
     Reaction("tilt", Level.BRAKE, ("V7",), TICK_S),

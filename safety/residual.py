@@ -37,7 +37,7 @@ class MotionMonitor:
         self._seen = self._expected = 0.0
         self._course = (0.0, 0.0)
         self._astray_s: float | None = None
-        self._failed_s: float | None = None
+        self._failed_s = 0.0
         self._weak = False
 
     @property
@@ -86,19 +86,19 @@ class MotionMonitor:
             found.append(Intervention("motion_direction", error, config.direction_error_m_s))
 
     def _judge_braking(self, state: VehicleState, history: CommandHistory, dt: float, found: list[Intervention]) -> None:
-        """A1, A3, V7: gather evidence; braking far weaker than assumed for too long is a fault."""
-        self._gather(state, history, dt)
+        """A1, A3, V7: gather evidence; braking far weaker than assumed is a fault when braking has shown it for long enough."""
+        braked = self._gather(state, history, dt)
         config, share = self._config, self.braking_share
         self._weak = share < (config.braking_healthy if self._weak else config.braking_weak)
         if not share < config.braking_failed:  # NaN: no evidence
-            self._failed_s = None
+            self._failed_s = 0.0
             return
-        self._failed_s = state.time_s if self._failed_s is None else self._failed_s
-        if state.time_s - self._failed_s > config.braking_failed_s + ROUNDING_S:
+        self._failed_s += dt if braked else 0.0
+        if self._failed_s > config.braking_failed_s + ROUNDING_S:
             found.append(Intervention("braking_weak", share, config.braking_failed))
 
-    def _gather(self, state: VehicleState, history: CommandHistory, dt: float) -> None:
-        """Compare with the newest sample that is at least the horizon old."""
+    def _gather(self, state: VehicleState, history: CommandHistory, dt: float) -> bool:
+        """Compare with the newest sample that is at least the horizon old; True where braking was to be seen."""
         kept = math.exp(-dt / self._config.braking_memory_s)
         self._seen, self._expected = self._seen * kept, self._expected * kept
         samples, begin_s = self._samples, state.time_s - self._config.braking_horizon_s + ROUNDING_S
@@ -107,12 +107,14 @@ class MotionMonitor:
         start, dead_s = samples[0], self._assumed.dead_time_s
         speed = math.hypot(start.velocity.x, start.velocity.y)
         if start.time_s > begin_s or speed < LEAST_SPEED_M_S:
-            return
+            return False
         phases = history.phases(start.time_s - dead_s, state.time_s - dead_s, start.velocity)
         expected_x, expected_y, _ = flown_velocity(start.velocity, phases, self._assumed.lag_s)
         ux, uy = start.velocity.x / speed, start.velocity.y / speed
         expected = min(speed - (expected_x * ux + expected_y * uy), speed)
-        if expected > LEAST_CHANGE_M_S:
-            seen = speed - (state.velocity.x * ux + state.velocity.y * uy)
-            self._seen += seen * expected * dt
-            self._expected += expected * expected * dt
+        if expected <= LEAST_CHANGE_M_S:
+            return False
+        seen = speed - (state.velocity.x * ux + state.velocity.y * uy)
+        self._seen += seen * expected * dt
+        self._expected += expected * expected * dt
+        return True

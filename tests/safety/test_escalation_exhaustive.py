@@ -1,7 +1,8 @@
 """The whole state machine: every state that can be reached from FLY, by every kind of input, in every bucket of time.
 
-A state is reduced to what the rules look at: the level and, for each clock in it, on which side of its limits it stands. Time
-moves in steps that hit every side of every limit. The search ends when no new reduced state appears: what holds then, holds always.
+A state is reduced to what the rules look at: the level and, for each clock in it, on which side of its limits it stands.
+Time moves in steps that hit every side of every limit. The search ends when no new reduced state appears: what holds then,
+holds always.
 """
 
 from __future__ import annotations

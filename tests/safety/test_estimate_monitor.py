@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from safety_plant import state
 
@@ -157,6 +157,7 @@ def test_what_the_estimator_says_of_itself():
     assert not any(rules(ticks, [Health(accuracy_m=2.0 if k % 16 else math.nan) for k in range(25)]))
 
 
+@settings(deadline=None)
 @given(
     st.lists(st.tuples(*[st.floats(-3.0, 3.0)] * 3), min_size=2, max_size=40),
     st.tuples(*[st.floats(-0.015, 0.015)] * 3),
@@ -171,12 +172,14 @@ def test_consistent_motion_is_never_accused(accelerations, bias):
     assert not any(rules(states, commanded=0.0))
 
 
+@settings(deadline=None)
 @given(st.floats(0.36, 50.0), st.floats(0, 2 * math.pi), st.floats(-1.2, 1.2), st.floats(-1.2, 1.2))
 def test_any_larger_step_is_a_jump(size, angle, vx, vy):
     shift = (size * math.cos(angle), size * math.sin(angle), 0.0)
     assert rules(cruise(4, v=(vx, vy, 0), shift=shift, at=3))[3] == ["estimate_jump"]
 
 
+@settings(deadline=None)
 @given(st.integers(0, 255), st.integers(0, 255))
 def test_reset_is_seen_if_and_only_if_the_counter_changed(a, b):
     pair = [dataclasses.replace(s, reset_counter=c) for s, c in zip(cruise(2), (a, b), strict=True)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from safety.braking import CommandHistory
@@ -122,6 +122,7 @@ def test_one_echo_of_ours_clears_the_suspicion():
     assert not any(rules(mixed, history=sent()))
 
 
+@settings(deadline=None)
 @given(st.lists(st.floats(0.0, 0.2), max_size=60))
 def test_late_is_raised_exactly_when_three_misses_lie_within_a_second(latenesses):
     found = rules([Health(lateness_s=late) for late in latenesses])
@@ -132,6 +133,7 @@ def test_late_is_raised_exactly_when_three_misses_lie_within_a_second(latenesses
         assert (found[k] == ["loop_late"]) == expected
 
 
+@settings(deadline=None)
 @given(st.lists(st.one_of(st.none(), st.integers(0, 3)), max_size=30))
 def test_a_restart_is_told_whenever_the_count_is_not_the_first_one(counts):
     known = [n for n in counts if n is not None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from safety_plant import command, config
 
@@ -99,6 +99,7 @@ def test_slower_swings_are_manoeuvres():
     assert not any(notices([command(0.5 if k // 2 % 2 else -0.5) for k in range(80)]))
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(-1.1, 1.1), st.floats(-1.1, 1.1), st.floats(-0.49, 0.49)), max_size=60))
 def test_oscillation_needs_ten_turns_in_a_row(velocities):
     turns = 0

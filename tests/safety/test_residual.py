@@ -73,7 +73,7 @@ def test_weaker_braking_lowers_the_cap_then_lands():
     first_cap, first_fault = next(k for k, cap in enumerate(caps) if cap < 1.0), next(k for k, r in enumerate(rules) if r)
     assert rules[first_fault] == ["braking_weak"]
     assert 40 < first_cap < 70, "within 1.5 s of the zero command"
-    assert first_cap < first_fault <= first_cap + 30
+    assert first_cap < first_fault <= first_cap + 60, "3 s"
     assert caps[first_cap] == pytest.approx(shares[first_cap])
     assert min(caps) < C.braking_failed
 
@@ -194,11 +194,13 @@ def test_speed_cap_leaves_slow_commands_alone():
     assert cap_speed(fast, 1.0, CONFIG)[0] is fast
 
 
+@settings(deadline=None)
 @given(st.floats(0.0, 3.0), st.floats(0.0, 3.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
 def test_more_delay_or_weaker_braking_never_allows_more(extra, more, braking, weaker):
     assert cap_factor(extra + more, braking * weaker, CONFIG) <= cap_factor(extra, braking, CONFIG)
 
 
+@settings(deadline=None)
 @given(*[st.floats(-1e6, 1e6)] * 3, st.floats(0.25, 1.0))
 def test_capped_command_obeys_the_share_of_both_limits_and_never_grows(x, y, z, factor):
     capped, _ = cap_speed(command(x, y, z), factor, CONFIG)
