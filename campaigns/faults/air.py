@@ -51,9 +51,7 @@ class Air:
     """Everything outside. `step` lets 4 ms pass; what arrives at the computer waits in `downlink` and `lidar_bytes`."""
 
     def __init__(self, world: World, estimate: str, seed: int, height_m: float, faults: tuple[Fault, ...]) -> None:
-        self.simulation = Simulation(
-            world, lidar=LidarConfig.device(), estimate=estimate, seed=seed, hover_height_m=height_m
-        )
+        self.simulation = Simulation(world, lidar=LidarConfig.device(), estimate=estimate, seed=seed, hover_height_m=height_m)
         self.vehicle = PilotedVehicle(self.simulation, ParameterStore(PARAMETERS), ready_after_s=0.0)
         self.autopilot = self.vehicle.autopilot
         self.telemetry = Telemetry(self.autopilot, self.vehicle.frame, self.vehicle.snapshot, lambda: self.time_s)
@@ -126,4 +124,3 @@ class Air:
             message = self.link.outbox.popleft()
             if isinstance(message, Garbage) or message.get_type() in STREAMED or message.get_type() == "COMMAND_ACK":
                 self.downlink.append((self.time_s + DOWNLINK_S, message))
-

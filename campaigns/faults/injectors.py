@@ -1,4 +1,4 @@
-"""Faults that the gateway cannot make: of the policy, of the process, of the computer. Each reaches into a `Stage` before it plays."""
+"""Faults that the gateway cannot make: of policy, process and computer. Each reaches into a `Stage` before it plays."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from policy_export.errors import PolicyOutputError
 from safety.messages import LidarScan
 
 LASTS_S = 3.0
+_FAR = 100_000  # the other device has been on for longer
 Action = NDArray[np.float32]
 
 
@@ -41,7 +42,7 @@ def second_scanner(stage: Stage) -> None:
         number = next(other)
         if scan is None or not 0.0 <= stage.air.time_s - stage.begin_s < LASTS_S or number % 2:
             return scan
-        return dataclasses.replace(scan, ranges_m=np.full_like(scan.ranges_m, 3.0), sequence=number)
+        return dataclasses.replace(scan, ranges_m=np.full_like(scan.ranges_m, 3.0), sequence=_FAR + number)
 
     lidar.latest = latest  # type: ignore[method-assign]
 
@@ -113,7 +114,7 @@ def policy_raises(stage: Stage) -> None:
 
 def hidden_not_finite(stage: Stage) -> None:
     """A bit has flipped in the recurrent state."""
-    stage.at(0.0, lambda: stage.policy.poison())
+    stage.at(0.0, stage.policy.poison)
 
 
 def hidden_explodes(stage: Stage) -> None:
@@ -189,9 +190,7 @@ def starved(stage: Stage) -> None:
     """Other programs take the processor."""
     generator = np.random.default_rng([stage.seed, 8])
     computer = stage.computer
-    computer.oversleep = lambda now_s: (
-        float(generator.uniform(0.06, 0.12)) if 0.0 <= now_s - stage.begin_s < LASTS_S else 0.0
-    )
+    computer.oversleep = lambda now_s: float(generator.uniform(0.06, 0.12)) if 0.0 <= now_s - stage.begin_s < LASTS_S else 0.0
 
 
 def signalled(stage: Stage) -> None:

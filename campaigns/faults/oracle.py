@@ -21,7 +21,7 @@ _HOLD, _LAND = (4.0, 3.0), (4.0, 6.0)
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """`problem`: None when all was right. `reaction_s`: None where nothing has to happen. `rules`: faults named while it lasted."""
+    """`problem`: None when all was right. `reaction_s`: None where nothing has to happen. `rules`: named while it lasted."""
 
     problem: str | None
     reaction_s: float | None
@@ -80,7 +80,7 @@ def _brake(trace: Trace, expected: Expected) -> tuple[float | None, str | None]:
     window = [(t, v) for t, v in trace.sent if trace.felt_s - ROUNDING_S <= t <= _until(trace, expected)]
     last = max((t for t, v in window if moving(v)), default=None)
     if last is None:
-        return 0.0, None
+        return (window[0][0] - trace.felt_s if window else 0.0), None
     after = min((t for t, _ in window if t > last), default=None)
     if after is not None and after - trace.felt_s <= expected.bound_s + ROUNDING_S:
         return after - trace.felt_s, None
@@ -138,14 +138,6 @@ def _away(trace: Trace, expected: Expected) -> tuple[float | None, str | None]:
     return last - trace.felt_s, None
 
 
-def _cap(trace: Trace, expected: Expected) -> tuple[float | None, str | None]:
-    """The first tick in which the cap speaks."""
-    for time_s, record in trace.records:
-        if time_s >= trace.felt_s - ROUNDING_S and any(i.rule == "speed_cap" for i in record.verdict.interventions):
-            return max(0.0, time_s - trace.felt_s), None
-    return None, "the speed cap never spoke"
-
-
 def _fly(trace: Trace, expected: Expected) -> tuple[float | None, str | None]:
     window = [(t, v) for t, v in trace.sent if trace.felt_s <= t <= _until(trace, expected)]
     records = [r for t, r in trace.records if trace.felt_s <= t <= _until(trace, expected)]
@@ -161,7 +153,9 @@ def _fly(trace: Trace, expected: Expected) -> tuple[float | None, str | None]:
 
 
 def _refuse(trace: Trace, _expected: Expected) -> tuple[float | None, str | None]:
-    asked = sum(command == COMMAND_DO_SET_MODE and numbers[0] == FlightMode.OFFBOARD.main for _, command, *numbers in trace.commands)
+    asked = sum(
+        command == COMMAND_DO_SET_MODE and numbers[0] == FlightMode.OFFBOARD.main for _, command, *numbers in trace.commands
+    )
     if any(mode is FlightMode.OFFBOARD for _, mode, _ in trace.modes):
         return None, "OFFBOARD was entered"
     if any(moving(v) for _, v in trace.sent):
@@ -175,7 +169,6 @@ _JUDGES: dict[Reaction, Callable[[Trace, Expected], tuple[float | None, str | No
     Reaction.YIELD: _yield,
     Reaction.STOP: _stop,
     Reaction.AWAY: _away,
-    Reaction.CAP: _cap,
     Reaction.FLY: _fly,
     Reaction.SAFE: lambda _trace, _expected: (None, None),
     Reaction.REFUSE: _refuse,

@@ -21,10 +21,10 @@ HEIGHT_M = 2.0
 ENGAGE_S = 1.3  # about where the loop begins, after the start of the handshake
 Action = tuple[float, float, float, float]
 # unequal walls and a pillar: nothing here looks alike when it is mirrored
-_SIDES = (box_row((6.0, 2.6, 2.0), (16.0, 0.2, 4.0)), box_row((6.0, -3.6, 2.0), (16.0, 0.2, 4.0)))
+_SIDES = (box_row((6.0, 2.3, 2.0), (16.0, 0.2, 4.0)), box_row((6.0, -3.0, 2.0), (16.0, 0.2, 4.0)))
 _PILLAR = box_row((5.2, 1.5, 2.0), (0.6, 0.6, 4.0))
-_WALL = box_row((8.0, -0.5, 2.0), (0.3, 6.4, 4.0))
-_START = (1.0, -0.5, 0.0)
+_WALL = box_row((8.0, -0.35, 2.0), (0.3, 5.4, 4.0))
+_START = (1.0, -0.4, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,13 +36,13 @@ class Scene:
     wants: Callable[[float], Action]
     begins_s: tuple[float, float]
     boxes: tuple[NDArray[np.float64], ...]
-    fence: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-1.0, -3.4, 0.5), (9.0, 2.4, 4.0))
+    fence: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-1.0, -2.9, 0.5), (9.0, 2.2, 4.0))
 
     def world(self, seed: int) -> World:
         """Where it happens; the start varies with the seed."""
         shift = np.random.default_rng([seed, 5]).uniform(-0.15, 0.15, 2)
         start = (_START[0] + float(shift[0]), _START[1] + float(shift[1]), 0.0)
-        return World(self.name, seed, 16.0, 6.2, 4.0, np.vstack(self.boxes), (), start, 0.0, (30.0, -0.5, HEIGHT_M))
+        return World(self.name, seed, 16.0, 5.4, 4.0, np.vstack(self.boxes), (), start, 0.0, (30.0, -0.5, HEIGHT_M))
 
     def safety(self, mission: Mission) -> SafetyConfig:
         """The mission's safety limits around this place."""
@@ -82,7 +82,7 @@ _LIST = (
         _steady(0.8, 0.4, 0.0, 0.0),
         (1.3, 1.9),
         (*_SIDES, _WALL),
-        ((-1.0, -3.0, 0.5), (4.4, 1.4, 4.0)),
+        ((-1.0, -2.6, 0.5), (4.4, 1.2, 4.0)),
     ),
 )
 SCENES: dict[str, Scene] = {scene.name: scene for scene in _LIST}

@@ -20,7 +20,7 @@ from flight.conclusion import bring_down, ending_of
 from flight.guard.core import Velocity
 from flight.interrupt import Interrupt
 from flight.landing import Landing
-from flight.mission import Mission
+from flight.mission import Mission, load_mission
 from flight.offboard import Ending, OffboardFlight
 from flight.recorder import FlightRecorder, NoRecorder
 from flight.recording_setup import flight_header, record_flight
@@ -209,7 +209,5 @@ def felt_s(stage: Stage, carrier: str) -> float:
 
 def load(mission: Path, policy: Path | None = None) -> tuple[Mission, PolicyRunner]:
     """Mission and policy of a campaign."""
-    from flight.mission import load_mission
-
     loaded = load_mission(mission)
     return loaded, PolicyRunner.load(policy or loaded.policy.path)
