@@ -36,10 +36,6 @@ MESSAGE_ID = {
     "CURRENT_MODE": 436,
 }
 
-FRAME_LOCAL_NED = 1
-# SET_POSITION_TARGET_LOCAL_NED: ignore position, acceleration and yaw; use velocity and yaw rate.
-TYPE_MASK_VELOCITY_YAW_RATE = 0x5C7
-
 GRAVITY_M_S2 = 9.80665
 
 
