@@ -22,6 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ FLYING_DEADLINE_S = 90.0
 LANDING_DEADLINE_S = 60.0
 WATCH_S = 4.0
 HARDWARE_PRIORITY = 40
+LATEST_PHASE_S = 0.5
 BRAKED_M_S = 0.25
 """Speed that counts as standing: PX4's hold on a noisy estimate drifts by so much."""
 
@@ -377,11 +379,12 @@ def main() -> int:
     parser.add_argument("--pauses", type=int, default=20, help="runs of the cells with SIGSTOP and SIGCONT of fly")
     parser.add_argument("--only", default="", help="only cells whose name holds this, e.g. 'guard SIGKILL'")
     parser.add_argument("--out", type=Path, default=Path("runs/process_death.json"))
+    parser.add_argument("--jobs", type=int, default=1, help="flights at a time")
     arguments = parser.parse_args()
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     cells = [cell for cell in CELLS if arguments.only in f"{cell.process} {cell.name}"]
     order = [cell for cell in cells for _ in range(arguments.pauses if _is_pause(cell) else arguments.repeats)]
-    result = fly_all(order, arguments.out)
+    result = fly_all(order, arguments.out, arguments.jobs)
     print(markdown(result))
     return 0 if result["good"] == len(order) else 1
 
@@ -390,24 +393,35 @@ def _is_pause(cell: Cell) -> bool:
     return cell.process == "fly" and cell.resume_s is not None
 
 
-def fly_all(order: list[Cell], out: Path) -> dict[str, Any]:
-    """Fly one after the other, the file written anew after each."""
+def fly_all(order: list[Cell], out: Path, jobs: int) -> dict[str, Any]:
+    """Fly all of them, the file written anew after each."""
     runs: list[Run] = []
     failed: list[str] = []
     phases = random.Random(0)
-    for index, cell in enumerate(order):
-        with tempfile.TemporaryDirectory() as folder:
-            try:
-                run = fly_once(cell, FIRST_SEED + index, Path(folder), phases.uniform(0.0, 0.5))
-            except (RuntimeError, OSError) as error:
-                failed.append(f"{cell.process} {cell.name}: {error}")
-                print(f"{index + 1}/{len(order)} {failed[-1]}", flush=True)
+    with ThreadPoolExecutor(jobs) as pool:
+        flights = [
+            pool.submit(fly_or_say_why, cell, FIRST_SEED + k, phases.uniform(0.0, LATEST_PHASE_S)) for k, cell in enumerate(order)
+        ]
+        for done, flight in enumerate(as_completed(flights), 1):
+            run = flight.result()
+            if isinstance(run, str):
+                failed.append(run)
+                print(f"{done}/{len(order)} {run}", flush=True)
                 continue
-        runs.append(run)
-        verdict = "good" if run.good else f"NOT GOOD {run}"
-        print(f"{index + 1}/{len(order)} {cell.process} {cell.name}: {run.late_moving} late, {run.ended}, {verdict}", flush=True)
-        out.write_text(json.dumps(summarise(runs, failed), indent=1) + "\n")
+            runs.append(run)
+            verdict = "good" if run.good else f"NOT GOOD {run}"
+            print(f"{done}/{len(order)} {run.process} {run.fault}: {run.late_moving} late, {run.ended}, {verdict}", flush=True)
+            out.write_text(json.dumps(summarise(runs, failed), indent=1) + "\n")
     return summarise(runs, failed)
+
+
+def fly_or_say_why(cell: Cell, seed: int, phase_s: float) -> Run | str:
+    """One run in a folder of its own; a line about it when it did not come to the fault."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            return fly_once(cell, seed, Path(folder), phase_s)
+        except (RuntimeError, OSError) as error:
+            return f"{cell.process} {cell.name}: {error}"
 
 
 if __name__ == "__main__":
