@@ -76,7 +76,13 @@ class Allowance:
 
 
 def allowance(
-    tube: Tubes, clear_m: Floats, fence_m: Floats, points_m: Floats, position_m: Floats, ways: WaysOut | None, config: SafetyConfig
+    tube: Tubes,
+    clear_m: Floats,
+    fence_m: Floats,
+    points_m: Floats,
+    position_m: Floats,
+    ways: WaysOut | None,
+    config: SafetyConfig,
 ) -> Allowance:
     """The allowance set by braking.
 

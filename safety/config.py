@@ -59,10 +59,10 @@ class Fence(_Frozen):
         xs, ys = zip(*self.polygon, strict=True)
         return max(xs), max(ys), self.ceiling_m if self.ceiling_m is not None else self._box()[1][2]
 
-    def margin_m(self, x: float, y: float, z: float) -> float:
-        """Distance of a point to the fence, negative outside, m."""
-        sideways = polygon_fence(self.polygon, self.exclusion).signed_margin_m(np.array((x, y)))
-        return min(float(sideways), z - self.low_m[2], self.high_m[2] - z)
+    def margin_m(self, x: float, y: float, z: float, radius_m: float = 0.0, half_height_m: float = 0.0) -> float:
+        """Distance of a point, or of a hull around it, to the fence, negative outside, m."""
+        sideways = float(polygon_fence(self.polygon, self.exclusion).signed_margin_m(np.array((x, y))))
+        return min(sideways - radius_m, min(z - self.low_m[2], self.high_m[2] - z) - half_height_m)
 
     def _box(self) -> tuple[Corner, Corner]:
         if self.min_m is None or self.max_m is None:
@@ -138,7 +138,7 @@ class SafetyConfig(_Frozen):
 
     @property
     def erosion_m(self) -> float:
-        """Distance the vehicle's centre keeps from an edge of the fence along an axis; more from slanted ones, see `PolygonFence`."""
+        """Distance the vehicle's centre keeps from an edge of the fence along an axis; a slanted one gets more (`PolygonFence`)."""
         return self.vehicle_radius_m + self.position_error_m + self.margin_m
 
     def eroded_fence(self) -> PolygonFence:

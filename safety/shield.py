@@ -124,9 +124,7 @@ class Shield:
         capped: Floats = candidates * np.stack((factor, factor, np.ones_like(factor)), axis=1)
         return capped
 
-    def _judge(
-        self, first: Floats, around: Surroundings, near: NearFence, found: list[Intervention]
-    ) -> tuple[bool, Allowance]:
+    def _judge(self, first: Floats, around: Surroundings, near: NearFence, found: list[Intervention]) -> tuple[bool, Allowance]:
         """Judge the wanted command (row 0) against the allowance that braking (row 1) sets."""
         tube = tubes(around.start, first, self._config)
         clear, fence = self._tube_clearances(tube, around), self._guard.rooms_m(tube, around.start, near)
@@ -138,9 +136,7 @@ class Shield:
             found.extend(_reasons(allowed, first[0], clear[0], fence[0]))
         return passed, allowed
 
-    def _nearest(
-        self, wanted: Floats, around: Surroundings, near: NearFence, allowed: Allowance, clearance_m: float
-    ) -> Floats:
+    def _nearest(self, wanted: Floats, around: Surroundings, near: NearFence, allowed: Allowance, clearance_m: float) -> Floats:
         """Of all candidates that pass, the one nearest to the wanted vector [3]; zeros when none passes."""
         brake = tubes(around.start, np.zeros((1, 3)), self._config)
         candidates = held_in(self._candidates(wanted, around, allowed), self._guard.ways_out(brake, near), self._config)
