@@ -56,7 +56,7 @@ class FenceGuard:
         margins = fence.ring_margins_m(begins)
         distance = edges.distances_m(*edges.along_across(begins[:, 0], begins[:, 1]))
         near = (distance < reach_m + fence.vertices.erosion_m[0]).any(axis=0)
-        breached = (margins < 0.0).any(axis=0)
+        breached: Booleans = margins.min(axis=0) < 0.0
         outside = bool(breached.any())
         if outside:
             near |= breached[edges.ring]
@@ -133,7 +133,7 @@ def _crossed(edges: Segments, along: Floats, across: Floats, start: Start) -> Bo
 
 def _crossing(edges: Segments, along_a: Floats, across_a: Floats, along_b: Floats, across_b: Floats) -> Booleans:
     """Whether straight ways from a to b cross the segments themselves."""
-    changed = (across_a < 0.0) != (across_b < 0.0)
+    changed: Booleans = (across_a < 0.0) != (across_b < 0.0)
     if not changed.any():
         return changed
     share = across_a / np.where(changed, across_a - across_b, 1.0)
