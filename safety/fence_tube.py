@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safety.braking import Start, Tubes
-from safety.config import SafetyConfig
-from safety.fence import Booleans, Segments
+from safety.fence import Booleans, PolygonFence, Segments
 from safety.frames import CorridorVector
 
 Floats = NDArray[np.float64]
@@ -43,11 +42,10 @@ class WaysOut:
 
 
 class FenceGuard:
-    """The eroded fence of a configuration, asked about brake tubes."""
+    """An eroded fence between two heights, asked about brake tubes."""
 
-    def __init__(self, config: SafetyConfig) -> None:
-        self._fence = config.eroded_fence()
-        self._low_z, self._high_z = config.keep_in_z()
+    def __init__(self, fence: PolygonFence, low_z_m: float, high_z_m: float) -> None:
+        self._fence, self._low_z, self._high_z = fence, low_z_m, high_z_m
 
     def look(self, position: CorridorVector, start: Start, reach_m: float) -> NearFence:
         """Take what tubes from `start` can come near to when they reach `reach_m`, and all of a polygon already breached."""

@@ -56,7 +56,7 @@ class Shield:
 
     def __init__(self, config: SafetyConfig) -> None:
         self._config = config
-        self._guard = FenceGuard(config)
+        self._guard = FenceGuard(config.eroded_fence(), *config.keep_in_z())
         directions = [(scale, 0.0) for scale in SCALES]
         directions += [(math.cos(turn), sign * turn) for turn in TURNS_RAD for sign in (1, -1)]
         self._scaled = np.array([(scale * math.cos(turn), scale * math.sin(turn)) for scale, turn in directions])
