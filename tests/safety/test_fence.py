@@ -259,7 +259,7 @@ def test_from_a_margin_only_the_way_back_is_open(depth, heading):
 @pytest.mark.parametrize("place", [(2.5, 8.5), (2.05, 8.5), (2.9, 8.9), (6.0, 6.0), (5.2, 5.2), (-0.5, 3.0), (12.5, 5.5)])
 @pytest.mark.parametrize("heading", range(8))
 def test_from_a_forbidden_place_no_command_leads_further_in(place, heading):
-    """In an exclusion, beyond a reflex corner, outside a wall and a corner: every command's part is towards the nearest way out."""
+    """In an exclusion, beyond a reflex corner, outside a wall and a corner: every part is towards the nearest way out."""
     wanted, fence = (math.cos(heading * math.pi / 4), math.sin(heading * math.pi / 4)), polygons()
     geometry = PolygonFence(fence.polygon, fence.exclusion)
     depth = float(geometry.signed_margin_m(place))
