@@ -227,6 +227,15 @@ class Simulation:
         state[QUAT : QUAT + 4] = (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
         state[OMEGA : OMEGA + 3] = 0.0
 
+    def disturb(self, position_m: Sequence[float], velocity_m_s: Sequence[float], wind_m_s: Sequence[float]) -> None:
+        """Put the estimate's errors and the steady wind where an adversary wants them (corridor frame), from the next step on.
+
+        They stay only where nothing random moves them: `EstimateNoise.held()` and no gusts.
+        """
+        self._error[POSITION_ERROR : POSITION_ERROR + 3] = position_m
+        self._error[VELOCITY_ERROR : VELOCITY_ERROR + 3] = velocity_m_s
+        self._wind_mean[:] = wind_m_s
+
     def advance_motors_off(self, n_steps: int) -> None:
         """Let `n_steps` of 4 ms pass with the motors off: at rest on the ground, falling in the air."""
         self._step(n_steps, np.zeros(3), 0.0, motors_on=False)

@@ -1,0 +1,164 @@
+"""One flight of one adversary: policy, filter, delays, vehicle, and the judge that looks at the truth alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from campaigns.adversaries.disturbance import Conditions, Disturbance
+from campaigns.adversaries.policies import Policy, View
+from campaigns.adversaries.scenes import Scene
+from campaigns.lockstep import TICK_S, lidar_scan, vehicle_state
+from safety.config import SafetyConfig
+from safety.filter import SafetyFilter
+from safety.frames import CorridorVector
+from safety.messages import BRAKE, SafeCommand, Verdict
+from sim_gateway.simulation import step_at
+
+ROUNDING = 1e-6
+MOVING_M_S = 0.1  # passive safety: what runs into a standing vehicle is not its doing
+HULL_RADIUS_M, HULL_HALF_HEIGHT_M = 0.35, 0.1  # the true hull, whatever the filter is told
+
+
+@dataclass
+class Outcome:
+    """What a flight came to. Distances of the true hull, m, negative = inside an obstacle, outside the fence.
+
+    `events`: kind of violation to how often it began. `first_s`: when the first one did.
+    """
+
+    ticks: int = 0
+    clearance_m: float = math.inf
+    fence_m: float = math.inf
+    events: dict[str, int] = field(default_factory=dict)
+    faults: dict[str, int] = field(default_factory=dict)
+    first_s: float | None = None
+    changed: int = 0
+    braking: int = 0
+
+    @property
+    def worst_m(self) -> float:
+        """The lesser of both distances."""
+        return min(self.clearance_m, self.fence_m)
+
+    def note(self, kind: str, now_s: float) -> None:
+        """A violation begins."""
+        self.events[kind] = self.events.get(kind, 0) + 1
+        self.first_s = now_s if self.first_s is None else self.first_s
+
+
+class Judge:
+    """Watches hull and commands. Limits are worked out again here, not taken from `safety.limits`."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._config, self.outcome = scene, scene.safety, Outcome()
+        self._last = BRAKE.velocity
+        self._touching = self._outside = False
+
+    def sent(self, command: SafeCommand, now_s: float) -> None:
+        """A command leaves: is it inside every limit?"""
+        for kind in broken_limits(command, self._last, self._config):
+            self.outcome.note(kind, now_s)
+        self._last = command.velocity
+
+    def flown(self, place: tuple[float, float, float], clearance_m: float, speed_m_s: float, now_s: float) -> None:
+        """Where the vehicle is now. `clearance_m`: the least since the last call."""
+        outcome, fence_m = self.outcome, self._scene.fence.margin_m(place, HULL_RADIUS_M, HULL_HALF_HEIGHT_M)
+        outcome.clearance_m, outcome.fence_m = min(outcome.clearance_m, clearance_m), min(outcome.fence_m, fence_m)
+        touching, outside = clearance_m < 0.0, fence_m < 0.0
+        if touching and not self._touching:
+            outcome.note("contact" if speed_m_s > MOVING_M_S else "contact at rest", now_s)
+        if outside and not self._outside:
+            outcome.note("fence", now_s)
+        self._touching, self._outside = touching, outside
+
+
+def broken_limits(command: SafeCommand, last: CorridorVector, config: SafetyConfig) -> list[str]:
+    """Names of the limits that a command breaks; a step is measured from the part of the last command that is kept."""
+    v, broken = command.velocity, []
+    if not all(map(math.isfinite, (v.x, v.y, v.z, command.yaw_rate_rad_s))):
+        return ["not finite"]
+    if math.hypot(v.x, v.y) > config.max_horizontal_speed_m_s + ROUNDING:
+        broken.append("speed")
+    if abs(v.z) > config.max_vertical_speed_m_s + ROUNDING:
+        broken.append("vertical speed")
+    if abs(command.yaw_rate_rad_s) > config.max_yaw_rate_rad_s + ROUNDING:
+        broken.append("yaw rate")
+    if step_m_s(v, last) > config.max_acceleration_m_s2 * config.tick_s + ROUNDING:
+        broken.append("acceleration")
+    return broken
+
+
+def step_m_s(new: CorridorVector, last: CorridorVector) -> float:
+    """Least distance of a command to the line from standstill to the last one: slowing down along it costs nothing."""
+    a, b = np.array((new.x, new.y, new.z)), np.array((last.x, last.y, last.z))
+    length2 = float(b @ b)
+    share = min(1.0, max(0.0, float(a @ b) / length2)) if length2 > 0.0 else 0.0
+    return float(np.linalg.norm(a - share * b))
+
+
+Watcher = Callable[[View, SafeCommand, Verdict, Outcome], None]
+
+
+class Duel:
+    """A filter against a policy in a scene. `errors`: sign of the estimate's errors by tick, None = as the conditions say."""
+
+    def __init__(self, scene: Scene, conditions: Conditions, seed: int, *, safety: SafetyFilter | None = None) -> None:
+        self.scene, self.conditions = scene, conditions
+        self.filter = safety or SafetyFilter(scene.safety)
+        self.simulation = conditions.simulation(scene.world, scene.height_m, seed)
+        self._random = np.random.default_rng((seed, 1))
+        self._disturbance = Disturbance(conditions, scene.safety, self._random)
+        self._judge, self.view = Judge(scene), View(scene, boxes=scene.boxes)
+        self._command = self._next = SafeCommand(BRAKE.velocity, 0.0)
+        self._scans = 0
+        self._scan = lidar_scan(self.simulation.scan(), 0)
+
+    def fly(self, policy: Policy, ticks: int, errors: Callable[[int], float] | None = None, watch: Watcher | None = None) -> Outcome:
+        """`ticks` ticks of the policy; `watch` is shown every tick."""
+        outcome = self._judge.outcome
+        for tick in range(ticks):
+            now_s = tick * TICK_S
+            self._look(tick, now_s, errors)
+            wanted = policy(self.view)
+            sent, verdict = self.filter.apply(wanted, self.view.state, self.view.scan, now_s)
+            self._judge.sent(sent, now_s)
+            if verdict.fault is not None:
+                outcome.faults[verdict.fault] = outcome.faults.get(verdict.fault, 0) + 1
+            outcome.changed += sent.velocity != wanted.velocity
+            outcome.braking += verdict.braking
+            if watch is not None:
+                watch(self.view, sent, verdict, outcome)
+            self._next = sent
+            self._fly_to(now_s)
+        outcome.ticks = ticks
+        return outcome
+
+    def _look(self, tick: int, now_s: float, errors: Callable[[int], float] | None) -> None:
+        """Take in the truth, disturb the estimate, and sample it."""
+        view, truth = self.view, self.simulation.truth
+        view.tick, view.yaw_rad = tick, truth.yaw_rad
+        view.place, view.velocity = np.array(truth.position_m), np.array(truth.velocity_m_s)
+        view.boxes = self.simulation.boxes() if self.scene.world.movers else self.scene.boxes
+        self._disturbance.apply(self.simulation, view.threat(), None if errors is None else errors(tick))
+        view.state, view.scan = vehicle_state(self.simulation.estimate(), now_s), self._scan
+
+    def _fly_to(self, now_s: float) -> None:
+        """One tick of vehicle time: the command arrives late, the next scan is taken a little before the next tick."""
+        simulation, next_s = self.simulation, now_s + TICK_S
+        arrival, end = step_at(now_s + self.conditions.command_delay_s), step_at(next_s)
+        scan_at = step_at(next_s - self.conditions.scan_age_s)
+        for until in sorted({arrival, scan_at, end}):
+            velocity = self._command.velocity
+            simulation.advance(until - simulation.steps, (velocity.x, velocity.y, velocity.z), self._command.yaw_rate_rad_s)
+            if until >= arrival:
+                self._command = self._next
+            if until == scan_at and self._random.random() >= self.conditions.lost_scans:
+                self._scans += 1
+                self._scan = lidar_scan(simulation.scan(), self._scans)
+            truth = simulation.truth
+            speed = math.hypot(*truth.velocity_m_s)
+            self._judge.flown(truth.position_m, simulation.clearance_m, speed, simulation.time_s)
