@@ -26,6 +26,7 @@ SLIDE_SHARE = 0.25  # of the margin: how far inside points may be neared, and wh
 HOLD_OFF_PER_S = 10.0  # speed outwards per metre inside; acts on the stop point, which follows a command at once
 POINT_BAND_M = 0.05  # hold off from points up to this far inside the hull; deeper is no drift
 FENCE_BAND_M = 0.5  # the same for the fence
+PUSH_ROUNDS = 16
 _LEAST_M = 1e-6
 _NO_NORMALS, _NO_SPEEDS = np.empty((2, 0)), np.empty(0)
 
@@ -69,12 +70,19 @@ class Allowance:
 
     @property
     def push_m_s(self) -> Floats:
-        """A horizontal velocity [2] that leads out of the points held off from; zeros when there are none."""
+        """A small horizontal velocity [2] that leads out of all points held off from, if there is one; zeros when there are none.
+
+        Projected onto the worst unmet direction, again and again: how many points lie on which side does not count.
+        """
+        push = np.zeros(2)
         if self.outward_m_s.shape[0] == 0:
-            return np.zeros(2)
-        sum_m_s: Floats = self.normals @ self.outward_m_s
-        length = max(float(np.hypot(*sum_m_s)), _LEAST_M)
-        push: Floats = sum_m_s * (float(self.outward_m_s.max()) / length)
+            return push
+        for _ in range(PUSH_ROUNDS):
+            lacking = self.outward_m_s - push @ self.normals
+            worst = int(np.argmax(lacking))
+            if lacking[worst] <= 0.0:
+                break
+            push += (lacking[worst] + EPSILON_M) * self.normals[:, worst]
         return push
 
 

@@ -13,7 +13,7 @@ from safety.braking import CommandHistory, predict_start
 from safety.config import SafetyConfig
 from safety.frames import CorridorVector
 from safety.lidar import BeamTable, SeenScan, see
-from safety.limits import limit_command
+from safety.limits import limit_command, within_limits
 from safety.memory import ObstacleMemory
 from safety.messages import BRAKE, Intervention, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
 from safety.monitors import InputMonitor
@@ -79,9 +79,10 @@ class SafetyFilter:
 
     def _steer(self, command: VelocityCommand, state: VehicleState, scan: LidarScan, now_s: float) -> tuple[SafeCommand, Verdict]:
         """All inputs are fit: limits, then the shield, then the gate."""
-        limited, limits = limit_command(command, self._last, self._dt_s(now_s), scan.range_max_m, self.config)
+        dt_s = self._dt_s(now_s)
+        limited, limits = limit_command(command, self._last, dt_s, scan.range_max_m, self.config)
         around = self._look(state, scan, now_s)
-        decision = self._shield.choose(limited.velocity, around)
+        decision = self._shield.choose(limited.velocity, around, lambda few: within_limits(few, self._last, dt_s, self.config))
         sent = SafeCommand(decision.velocity, limited.yaw_rate_rad_s)
         problem = gate_problem(sent, self.config)
         if problem is not None:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from safety.config import SafetyConfig, speed_cap_m_s
 from safety.frames import CorridorVector
 from safety.messages import Intervention, VelocityCommand
@@ -60,3 +63,16 @@ def _limit_acceleration(
     found.append(Intervention("acceleration_limit", step, limit))
     share = limit / step
     return CorridorVector(bx + dx * share, by + dy * share, bz + dz * share)
+
+
+def within_limits(
+    candidates_m_s: NDArray[np.float64], last: CorridorVector, dt_s: float, config: SafetyConfig
+) -> NDArray[np.bool_]:
+    """Which velocities [c, 3] obey the speed and acceleration limits: what evades an obstacle is bound by them too."""
+    kept = np.array((last.x, last.y, last.z))
+    along = candidates_m_s @ kept / max(float(kept @ kept), ROUNDING_M_S**2)
+    step = candidates_m_s - np.clip(along, 0.0, 1.0)[:, None] * kept
+    slow = np.hypot(candidates_m_s[:, 0], candidates_m_s[:, 1]) <= config.max_horizontal_speed_m_s
+    near = np.einsum("ci,ci->c", step, step) <= (config.max_acceleration_m_s2 * dt_s + ROUNDING_M_S) ** 2
+    within: NDArray[np.bool_] = slow & near & (np.abs(candidates_m_s[:, 2]) <= config.max_vertical_speed_m_s)
+    return within

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ from safety.lidar import SeenScan, blind
 from safety.messages import Intervention
 
 Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
 SCALES = (0.8, 0.6, 0.4, 0.2, 0.1, 0.05)
 TURNS_RAD = tuple(math.radians(angle) for angle in (15.0, 30.0, 45.0, 60.0, 75.0, 85.0))
 PUSHES = (1.0, 1.5)  # candidates are shifted by these multiples of what leads out of a margin
@@ -61,8 +63,11 @@ class Shield:
         directions += [(math.cos(turn), sign * turn) for turn in TURNS_RAD for sign in (1, -1)]
         self._scaled = np.array([(scale * math.cos(turn), scale * math.sin(turn)) for scale, turn in directions])
 
-    def choose(self, wanted: CorridorVector, around: Surroundings) -> Decision:
-        """The wanted velocity itself when it is safe (same object), else the nearest safe candidate, else zero."""
+    def choose(self, wanted: CorridorVector, around: Surroundings, within_limits: Callable[[Floats], Booleans]) -> Decision:
+        """The wanted velocity itself when it is safe (same object), else the nearest safe candidate, else zero.
+
+        `within_limits`: which candidates [c, 3] may be sent at all after the command sent last.
+        """
         clearance, fence_margin = self._clearance_now(around), self._fence_margin(around.position)
         around = self._within_reach(around)
         first = np.array(((wanted.x, wanted.y, wanted.z), (0.0, 0.0, 0.0)))
@@ -73,7 +78,7 @@ class Shield:
             if not found:
                 return Decision(wanted, (), clearance, fence_margin)
             return Decision(_vector(first[0]), tuple(found), clearance, fence_margin)
-        chosen = self._nearest(first[0], around, brake, clearance, fence_margin)
+        chosen = self._nearest(first[0], around, brake, clearance, fence_margin, within_limits)
         return Decision(_vector(chosen), tuple(found), clearance, fence_margin)
 
     def _clearance_now(self, around: Surroundings) -> float:
@@ -136,11 +141,20 @@ class Shield:
         return passed, allowed
 
     def _nearest(
-        self, wanted: Floats, around: Surroundings, allowed: Allowance, clearance_m: float, fence_margin_m: float
+        self,
+        wanted: Floats,
+        around: Surroundings,
+        allowed: Allowance,
+        clearance_m: float,
+        fence_margin_m: float,
+        within_limits: Callable[[Floats], Booleans],
     ) -> Floats:
         """Of all candidates that pass, the one nearest to the wanted vector [3]; zeros when none passes."""
         candidates = self._view_capped(self._candidates(wanted, around, allowed), around, clearance_m, fence_margin_m, [])
         candidates = allowed.clipped(candidates)
+        candidates = candidates[within_limits(candidates)]
+        if candidates.shape[0] == 0:
+            return np.zeros(3)
         tube = tubes(around.start, candidates, self._config)
         passed = allowed.permits(candidates, self._tube_clearances(tube, around), self._tube_fence(tube))
         away = candidates - wanted

@@ -13,9 +13,9 @@ from campaigns.adversaries.policies import Policy, View
 from campaigns.adversaries.scenes import Scene
 from campaigns.lockstep import TICK_S, lidar_scan, vehicle_state
 from safety.config import SafetyConfig
-from safety.filter import SafetyFilter
+from safety.filter import MAX_GAP_TICKS, SafetyFilter
 from safety.frames import CorridorVector
-from safety.messages import BRAKE, SafeCommand, Verdict
+from safety.messages import BRAKE, LidarScan, SafeCommand, Verdict
 from sim_gateway.simulation import step_at
 
 ROUNDING = 1e-6
@@ -55,14 +55,14 @@ class Judge:
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._config, self.outcome = scene, scene.safety, Outcome()
-        self._last = BRAKE.velocity
+        self._last, self._ticks_since = BRAKE.velocity, MAX_GAP_TICKS  # as after a pause
         self._touching = self._outside = False
 
     def sent(self, command: SafeCommand, now_s: float) -> None:
         """A command leaves: is it inside every limit?"""
-        for kind in broken_limits(command, self._last, self._config):
+        for kind in broken_limits(command, self._last, self._ticks_since * TICK_S, self._config):
             self.outcome.note(kind, now_s)
-        self._last = command.velocity
+        self._last, self._ticks_since = command.velocity, 1.0
 
     def flown(self, place: tuple[float, float, float], clearance_m: float, speed_m_s: float, now_s: float) -> None:
         """Where the vehicle is now. `clearance_m`: the least since the last call."""
@@ -76,8 +76,8 @@ class Judge:
         self._touching, self._outside = touching, outside
 
 
-def broken_limits(command: SafeCommand, last: CorridorVector, config: SafetyConfig) -> list[str]:
-    """Names of the limits that a command breaks; a step is measured from the part of the last command that is kept."""
+def broken_limits(command: SafeCommand, last: CorridorVector, since_s: float, config: SafetyConfig) -> list[str]:
+    """Names of the limits that a command breaks. `since_s`: time since the `last` one."""
     v, broken = command.velocity, []
     if not all(map(math.isfinite, (v.x, v.y, v.z, command.yaw_rate_rad_s))):
         return ["not finite"]
@@ -87,7 +87,7 @@ def broken_limits(command: SafeCommand, last: CorridorVector, config: SafetyConf
         broken.append("vertical speed")
     if abs(command.yaw_rate_rad_s) > config.max_yaw_rate_rad_s + ROUNDING:
         broken.append("yaw rate")
-    if step_m_s(v, last) > config.max_acceleration_m_s2 * config.tick_s + ROUNDING:
+    if step_m_s(v, last) > config.max_acceleration_m_s2 * since_s + ROUNDING:
         broken.append("acceleration")
     return broken
 
@@ -104,7 +104,7 @@ Watcher = Callable[[View, SafeCommand, Verdict, Outcome], None]
 
 
 class Duel:
-    """A filter against a policy in a scene. `errors`: sign of the estimate's errors by tick, None = as the conditions say."""
+    """A filter against a policy in a scene. `alter` may change what the filter is shown of a scan, at a time."""
 
     def __init__(self, scene: Scene, conditions: Conditions, seed: int, *, safety: SafetyFilter | None = None) -> None:
         self.scene, self.conditions = scene, conditions
@@ -114,11 +114,12 @@ class Duel:
         self._disturbance = Disturbance(conditions, scene.safety, self._random)
         self._judge, self.view = Judge(scene), View(scene, boxes=scene.boxes)
         self._command = self._next = SafeCommand(BRAKE.velocity, 0.0)
+        self.alter: Callable[[LidarScan, float], LidarScan] | None = None
         self._scans = 0
         self._scan = lidar_scan(self.simulation.scan(), 0)
 
     def fly(self, policy: Policy, ticks: int, errors: Callable[[int], float] | None = None, watch: Watcher | None = None) -> Outcome:
-        """`ticks` ticks of the policy; `watch` is shown every tick."""
+        """`ticks` ticks of the policy. `errors`: sign of the estimate's errors by tick, None = as the conditions say."""
         outcome = self._judge.outcome
         for tick in range(ticks):
             now_s = tick * TICK_S
@@ -144,7 +145,10 @@ class Duel:
         view.place, view.velocity = np.array(truth.position_m), np.array(truth.velocity_m_s)
         view.boxes = self.simulation.boxes() if self.scene.world.movers else self.scene.boxes
         self._disturbance.apply(self.simulation, view.threat(), None if errors is None else errors(tick))
-        view.state, view.scan = vehicle_state(self.simulation.estimate(), now_s), self._scan
+        view.state, view.scan = vehicle_state(self.simulation.estimate(), now_s), self._altered(now_s)
+
+    def _altered(self, now_s: float) -> LidarScan:
+        return self._scan if self.alter is None else self.alter(self._scan, now_s)
 
     def _fly_to(self, now_s: float) -> None:
         """One tick of vehicle time: the command arrives late, the next scan is taken a little before the next tick."""
