@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from campaigns.adversaries.disturbance import Conditions, Disturbance
 from campaigns.adversaries.policies import Policy, View
@@ -17,7 +18,9 @@ from safety.filter import MAX_GAP_TICKS, SafetyFilter
 from safety.frames import CorridorVector
 from safety.messages import BRAKE, LidarScan, SafeCommand, Verdict
 from sim_gateway.simulation import step_at
+from sim_gateway.vehicle import POS, VEL
 
+Array = NDArray[np.float64]
 ROUNDING = 1e-6
 MOVING_M_S = 0.1  # passive safety: what runs into a standing vehicle is not its doing
 HULL_RADIUS_M, HULL_HALF_HEIGHT_M = 0.35, 0.1  # the true hull, whatever the filter is told
@@ -64,13 +67,14 @@ class Judge:
             self.outcome.note(kind, now_s)
         self._last, self._ticks_since = command.velocity, 1.0
 
-    def flown(self, place: tuple[float, float, float], clearance_m: float, speed_m_s: float, now_s: float) -> None:
-        """Where the vehicle is now. `clearance_m`: the least since the last call."""
+    def flown(self, place: Array, clearance_m: float, velocity: Array, now_s: float) -> None:
+        """Where the vehicle is now, [3] each, and how clear of the nearest box."""
         outcome, fence_m = self.outcome, self._scene.fence.margin_m(place, HULL_RADIUS_M, HULL_HALF_HEIGHT_M)
         outcome.clearance_m, outcome.fence_m = min(outcome.clearance_m, clearance_m), min(outcome.fence_m, fence_m)
         touching, outside = clearance_m < 0.0, fence_m < 0.0
         if touching and not self._touching:
-            outcome.note("contact" if speed_m_s > MOVING_M_S else "contact at rest", now_s)
+            moving = float(np.linalg.norm(velocity)) > MOVING_M_S
+            outcome.note("contact" if moving else "contact at rest", now_s)
         if outside and not self._outside:
             outcome.note("fence", now_s)
         self._touching, self._outside = touching, outside
@@ -163,6 +167,5 @@ class Duel:
             if until == scan_at and self._random.random() >= self.conditions.lost_scans:
                 self._scans += 1
                 self._scan = lidar_scan(simulation.scan(), self._scans)
-            truth = simulation.truth
-            speed = math.hypot(*truth.velocity_m_s)
-            self._judge.flown(truth.position_m, simulation.clearance_m, speed, simulation.time_s)
+            row = simulation.state_row
+            self._judge.flown(row[POS : POS + 3], simulation.clearance_m, row[VEL : VEL + 3], simulation.time_s)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -51,27 +52,47 @@ class FenceShape:
 
     def inside(self, x: float, y: float) -> bool:
         """Whether a point lies in the free area, by the even-odd rule over all rings."""
-        crossings = 0
-        for ax, ay, bx, by in self.edges.tolist():
-            if (ay > y) != (by > y) and x < ax + (y - ay) / (by - ay) * (bx - ax):
-                crossings += 1
-        return crossings % 2 == 1
+        return bool(_boundary(self.edges, x, y)[2])
 
     def nearest(self, x: float, y: float) -> Point:
         """The point of the boundary nearest to (x, y)."""
-        a, b = self.edges[:, :2], self.edges[:, 2:]
-        leg, to = b - a, np.array((x, y)) - a
-        share = np.clip((to * leg).sum(axis=1) / (leg * leg).sum(axis=1), 0.0, 1.0)
-        feet = a + share[:, None] * leg
-        best = feet[int(np.argmin(((feet - (x, y)) ** 2).sum(axis=1)))]
-        return float(best[0]), float(best[1])
+        foot_x, foot_y, _ = _boundary(self.edges, x, y)
+        return float(foot_x), float(foot_y)
 
-    def margin_m(self, place: Place, radius_m: float, half_height_m: float) -> float:
+    def margin_m(self, place: Place | Array, radius_m: float, half_height_m: float) -> float:
         """Distance of an upright cylinder inside the fence, negative where any part of it is outside, m."""
         x, y, z = place
-        foot = self.nearest(x, y)
-        side = math.hypot(x - foot[0], y - foot[1]) * (1.0 if self.inside(x, y) else -1.0)
+        foot_x, foot_y, inside = _boundary(self.edges, x, y)
+        side = math.hypot(x - foot_x, y - foot_y) * (1.0 if inside else -1.0)
         return min(side - radius_m, z - half_height_m - self.z_low_m, self.z_high_m - z - half_height_m)
+
+
+@njit(cache=True)
+def _boundary(edges: Array, x: float, y: float) -> tuple[float, float, bool]:
+    """Nearest point of the edges [e, 4] to (x, y), and whether (x, y) is inside, by crossings of a ray along x."""
+    best, foot_x, foot_y, inside = math.inf, 0.0, 0.0, False
+    for i in range(edges.shape[0]):
+        ax, ay, bx, by = edges[i]
+        dx, dy = bx - ax, by - ay
+        share = min(1.0, max(0.0, ((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy)))
+        px, py = ax + share * dx, ay + share * dy
+        distance = (x - px) ** 2 + (y - py) ** 2
+        if distance < best:
+            best, foot_x, foot_y = distance, px, py
+        if (ay > y) != (by > y) and x < ax + (y - ay) / dy * dx:
+            inside = not inside
+    return foot_x, foot_y, inside
+
+
+@njit(cache=True)
+def to_nearest_box(boxes: Array, x: float, y: float) -> tuple[float, float]:
+    """Horizontal vector from (x, y) to the nearest surface of `boxes` [n, 6]; zero inside one."""
+    best, best_x, best_y = math.inf, math.inf, math.inf
+    for i in range(boxes.shape[0]):
+        dx, dy = min(max(x, boxes[i, 0]), boxes[i, 3]) - x, min(max(y, boxes[i, 1]), boxes[i, 4]) - y
+        if dx * dx + dy * dy < best:
+            best, best_x, best_y = dx * dx + dy * dy, dx, dy
+    return best_x, best_y
 
 
 def _turning(ring: Ring, sense: float) -> list[Point]:

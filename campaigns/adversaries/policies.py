@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from campaigns.adversaries.geometry import to_nearest_box
 from campaigns.adversaries.scenes import Scene
 from safety.frames import CorridorVector
 from safety.messages import LidarScan, VehicleState, VelocityCommand
@@ -34,10 +35,7 @@ class View:
 
     def to_obstacle(self) -> Array:
         """Horizontal vector [2] to the nearest obstacle's surface."""
-        x, y = self.place[0], self.place[1]
-        away = np.stack((np.clip(x, self.boxes[:, 0], self.boxes[:, 3]) - x, np.clip(y, self.boxes[:, 1], self.boxes[:, 4]) - y))
-        nearest: Array = away[:, int(np.argmin((away * away).sum(axis=0)))]
-        return nearest
+        return np.array(to_nearest_box(self.boxes, self.place[0], self.place[1]))
 
     def to_fence(self) -> Array:
         """Horizontal vector [2] to the nearest part of the fence."""
