@@ -66,6 +66,11 @@ class Allowance:
         return permitted
 
     @property
+    def hover_m_s(self) -> Floats:
+        """No horizontal command [3]; vertically none either, but for what leads back from floor or ceiling."""
+        return np.array((0.0, 0.0, min(max(0.0, self.sink_m_s), self.climb_m_s)))
+
+    @property
     def push_m_s(self) -> Floats:
         """A small horizontal velocity [2] that leads out of all points held off from, if there is one; zeros when there are none.
 

@@ -83,6 +83,8 @@ def _crossed(ring: Ring) -> str | None:
 def segments_touch(first: tuple[Vertex, Vertex], second: tuple[Vertex, Vertex]) -> bool:
     """Whether two segments cross or come nearer than `LEAST_GAP_M`."""
     (a, b), (c, d) = first, second
+    if any(max(a[i], b[i]) + LEAST_GAP_M < min(c[i], d[i]) or max(c[i], d[i]) + LEAST_GAP_M < min(a[i], b[i]) for i in (0, 1)):
+        return False  # on one line but apart, rounding alone would decide below
     if (_side(a, b, c) > 0.0) != (_side(a, b, d) > 0.0) and (_side(c, d, a) > 0.0) != (_side(c, d, b) > 0.0):
         return True
     return min(_gap_m(a, c, d), _gap_m(b, c, d), _gap_m(c, a, b), _gap_m(d, a, b)) < LEAST_GAP_M

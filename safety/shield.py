@@ -151,16 +151,16 @@ class Shield:
         return candidates
 
     def _nearest(self, wanted: Floats, candidates: Floats, around: Surroundings, near: NearFence, allowed: Allowance) -> Floats:
-        """Of the candidates [c, 3] that pass, the one nearest to the wanted vector [3]; zeros when none passes."""
+        """Of the candidates [c, 3] that pass, the one nearest to the wanted vector [3]; when none passes, horizontally none."""
         if candidates.shape[0] == 0:
-            return np.zeros(3)
+            return allowed.hover_m_s
         tube = tubes(around.start, candidates, self._config)
         rooms = self._guard.rooms_m(tube, around.start, near)
         passed = allowed.permits(candidates, self._tube_clearances(tube, around), rooms)
         away = candidates - wanted
         cost = np.where(passed, np.einsum("ci,ci->c", away, away), math.inf)
         best = int(np.argmin(cost))
-        return candidates[best] if passed[best] else np.zeros(3)
+        return candidates[best] if passed[best] else allowed.hover_m_s
 
     def _candidates(self, wanted: Floats, around: Surroundings, allowed: Allowance) -> Floats:
         """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from campaigns.adversaries.geometry import FenceShape, Place
+from campaigns.adversaries.geometry import FenceShape, Place, Ring
 from safety.config import Fence, SafetyConfig
 from sim_gateway.collision import clearance_m
 from sim_gateway.corridor import CorridorConfig, generate_corridor
@@ -37,6 +37,20 @@ class Scene:
     def boxes(self) -> Array:
         """Static boxes [n, 6]."""
         return self.world.static_boxes
+
+
+CONCAVE: tuple[Ring, ...] = (
+    ((0.0, 0.0), (9.0, 0.0), (9.0, 3.0), (3.0, 3.0), (3.0, 8.0), (0.0, 8.0)),
+    ((0.0, 0.0), (9.0, 0.0), (9.0, 7.0), (6.0, 7.0), (6.0, 2.5), (3.5, 2.5), (3.5, 7.0), (0.0, 7.0)),
+    ((6.0, 0.0), (2.2, 1.6), (1.5, 5.5), (-1.0, 2.5), (-5.0, 3.5), (-2.5, 0.0), (-5.0, -3.5), (-1.0, -2.5), (1.5, -5.5), (2.2, -1.6)),
+    ((0.0, 0.0), (5.0, 0.0), (5.0, 2.0), (8.0, 2.4), (8.0, 0.0), (13.0, 0.0), (13.0, 6.0), (8.0, 6.0), (8.0, 4.0), (5.0, 3.8),
+     (5.0, 6.0), (0.0, 6.0)),
+)  # fmt: skip
+CUT_OUT: tuple[Ring, ...] = (
+    ((1.2, 0.0), (-0.6, 1.0), (-0.6, -1.0)),
+    ((1.0, 0.0), (0.0, 1.5), (-1.0, 0.0), (0.0, -1.5)),
+    ((1.6, 0.1), (-1.6, 0.1), (-1.6, -0.1), (1.6, -0.1)),
+)
 
 
 class _Builder:
@@ -104,6 +118,40 @@ def _gaps(build: _Builder) -> None:
         build.wall(x, y + 0.5 * gap, x + thick, HALF_WIDTH_M + 1.0)
 
 
+def _convex(build: _Builder) -> None:
+    """A convex fence of four to seven sides, acute corners among them, and a few pillars."""
+    angles = np.sort(build.random.uniform(0.0, 2.0 * math.pi, int(build.random.integers(4, 8))))
+    while np.diff(angles, append=angles[0] + 2.0 * math.pi).max() > 2.4 or np.diff(angles).min() < 0.3:
+        angles = np.sort(build.random.uniform(0.0, 2.0 * math.pi, len(angles)))
+    ring = tuple((7.0 + 7.0 * math.cos(angle), 5.0 * math.sin(angle)) for angle in angles)
+    build.fence = FenceShape(ring, 0.4, 3.5)
+    build.scatter(int(build.random.integers(0, 5)), (0.3, 0.8))
+
+
+def _concave(build: _Builder) -> None:
+    """An L, a U, a star or a slot, turned, with a few pillars."""
+    ring = CONCAVE[int(build.random.integers(len(CONCAVE)))]
+    turn = float(build.random.uniform(-math.pi, math.pi))
+    build.fence = FenceShape(_turned(ring, turn), 0.4, 3.5)
+    build.scatter(int(build.random.integers(0, 4)), (0.3, 0.8))
+
+
+def _exclusions(build: _Builder) -> None:
+    """A box with a triangle, a diamond and a bar cut out, turned at random, and a few pillars."""
+    holes = []
+    for x, shape in zip((2.5, 7.0, 11.5), CUT_OUT, strict=True):
+        turned = _turned(shape, float(build.random.uniform(-math.pi, math.pi)), float(build.random.uniform(0.6, 1.3)))
+        y = float(build.random.uniform(-2.0, 2.0))
+        holes.append(tuple((x + a, y + b) for a, b in turned))
+    build.fence = FenceShape(build.fence.outer, 0.4, 3.5, tuple(holes))
+    build.scatter(int(build.random.integers(0, 4)), (0.3, 0.6))
+
+
+def _turned(ring: Ring, angle: float, scale: float = 1.0) -> Ring:
+    c, s = scale * math.cos(angle), scale * math.sin(angle)
+    return tuple((c * x - s * y, s * x + c * y) for x, y in ring)
+
+
 def _movers(build: _Builder) -> None:
     """Pillars that go back and forth at the speed that the filter is told."""
     random, movers = build.random, []
@@ -120,9 +168,12 @@ _LAYOUTS: dict[str, Callable[[_Builder], None]] = {
     "poles": _poles,
     "dead ends": _dead_ends,
     "gaps": _gaps,
+    "convex": _convex,
+    "concave": _concave,
+    "exclusions": _exclusions,
     "movers": _movers,
 }
-SCENES = ("box", "pillars", "poles", "dead ends", "gaps", "corridor")
+SCENES = ("box", "convex", "concave", "exclusions", "pillars", "poles", "dead ends", "gaps", "corridor")
 CORRIDOR = CorridorConfig(pillars=(8, 14))
 
 
@@ -146,10 +197,7 @@ def make_scene(name: str, random: np.random.Generator, **safety: float) -> Scene
 
 def told(shape: FenceShape) -> Fence:
     """The fence in the filter's own words."""
-    low, high = shape.corners.min(axis=0), shape.corners.max(axis=0)
-    return Fence(
-        min_m=(float(low[0]), float(low[1]), shape.z_low_m), max_m=(float(high[0]), float(high[1]), shape.z_high_m)
-    )
+    return Fence(floor_m=shape.z_low_m, ceiling_m=shape.z_high_m, inclusion=shape.outer, exclusion=shape.holes)
 
 
 def _start(boxes: Array, fence: FenceShape, random: np.random.Generator) -> Place:
