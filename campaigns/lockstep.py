@@ -123,6 +123,8 @@ class LockstepFlight:
         """Sample, tick, and put the command on its way. Vehicle time stands at `now_s` before and after."""
         record = self.pilot.tick(self._latest, vehicle_state(self.simulation.estimate(), now_s), now_s)
         self.log.append(record, now_s)
+        if braking:
+            self.pilot.pause(now_s)
         self._next = SafeCommand(BRAKE.velocity, 0.0) if braking else record.sent
         return record
 

@@ -214,14 +214,18 @@ class Channels:
     def _fence_lines(self, fence: Fence) -> list[Any]:
         """Each polygon of the fence as a closed line, at its floor and at its ceiling."""
         messages, red = self._messages, self._messages.Color(r=0.8, g=0.2, b=0.2, a=0.9)
+        pose = self._pose_of(CorridorVector(0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
         return [
             messages.LinePrimitive(
-                type=messages.LinePrimitiveLineType.LineLoop, pose=self._pose_of(CorridorVector(0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
-                thickness=0.04, color=red, points=[messages.Point3(x=x, y=y, z=z) for x, y in ring],
+                type=messages.LinePrimitiveLineType.LineLoop,
+                pose=pose,
+                thickness=0.04,
+                color=red,
+                points=[messages.Point3(x=x, y=y, z=z) for x, y in ring],
             )
             for ring in (fence.polygon, *fence.exclusion)
             for z in (fence.low_m[2], fence.high_m[2])
-        ]  # fmt: skip
+        ]
 
     def _cube(self, box: tuple[float, ...], color: Any) -> Any:
         low, high = box[:3], box[3:]

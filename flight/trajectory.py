@@ -158,8 +158,8 @@ def _draw_surroundings(axes: Axes, boxes: NDArray[np.float64] | None, hits_m: ND
         )
     if fence is not None:
         for k, ring in enumerate((fence.polygon, *fence.exclusion)):
-            style = {"edgecolor": "#c0392b", "linestyle": (0, (6, 4)), "zorder": 3, "label": "" if k else "fence"}
-            axes.add_patch(Polygon(ring, fill=k > 0, facecolor="#c0392b22", **style))
+            fill, label = ("#c0392b22", "") if k else ("none", "fence")
+            axes.add_patch(Polygon(ring, facecolor=fill, edgecolor="#c0392b", linestyle=(0, (6, 4)), zorder=3, label=label))
             axes.update_datalim(ring)
 
 

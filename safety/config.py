@@ -98,6 +98,7 @@ class SafetyConfig(_Frozen):
     max_horizontal_speed_m_s: Positive = Field(1.2, description="longest horizontal velocity command")
     max_vertical_speed_m_s: Positive = Field(0.5, description="largest vertical velocity command, either way")
     max_acceleration_m_s2: Positive = Field(10.0, description="how fast a command may grow or turn; slowing down is free")
+    max_jerk_m_s3: Positive = Field(150.0, description="how fast that growth may itself grow or turn; easing off is free")
     max_yaw_rate_rad_s: Positive = Field(1.0, description="largest yaw rate command, either way")
 
     vehicle_radius_m: Positive = Field(0.35, description="A5: the vehicle fits into this horizontal circle")
@@ -143,7 +144,7 @@ class SafetyConfig(_Frozen):
 
     @property
     def erosion_m(self) -> float:
-        """Distance the vehicle's centre keeps from an edge of the fence along an axis; a slanted one gets more (`PolygonFence`)."""
+        """Distance the vehicle's centre keeps from edges of the fence along an axis; slanted ones get more (`PolygonFence`)."""
         return self.vehicle_radius_m + self.position_error_m + self.margin_m
 
     def eroded_fence(self) -> PolygonFence:

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safety.braking import Start, Tubes
-from safety.config import SafetyConfig
-from safety.fence import Booleans, Segments
+from safety.fence import Booleans, PolygonFence, Segments
 from safety.frames import CorridorVector
 
 Floats = NDArray[np.float64]
@@ -43,11 +42,10 @@ class WaysOut:
 
 
 class FenceGuard:
-    """The eroded fence of a configuration, asked about brake tubes."""
+    """An eroded fence between two heights, asked about brake tubes."""
 
-    def __init__(self, config: SafetyConfig) -> None:
-        self._fence = config.eroded_fence()
-        self._low_z, self._high_z = config.keep_in_z()
+    def __init__(self, fence: PolygonFence, low_z_m: float, high_z_m: float) -> None:
+        self._fence, self._low_z, self._high_z = fence, low_z_m, high_z_m
 
     def look(self, position: CorridorVector, start: Start, reach_m: float) -> NearFence:
         """Take what tubes from `start` can come near to when they reach `reach_m`, and all of a polygon already breached."""
@@ -56,7 +54,7 @@ class FenceGuard:
         margins = fence.ring_margins_m(begins)
         distance = edges.distances_m(*edges.along_across(begins[:, 0], begins[:, 1]))
         near = (distance < reach_m + fence.vertices.erosion_m[0]).any(axis=0)
-        breached = (margins < 0.0).any(axis=0)
+        breached: Booleans = margins.min(axis=0) < 0.0
         outside = bool(breached.any())
         if outside:
             near |= breached[edges.ring]
@@ -133,7 +131,7 @@ def _crossed(edges: Segments, along: Floats, across: Floats, start: Start) -> Bo
 
 def _crossing(edges: Segments, along_a: Floats, across_a: Floats, along_b: Floats, across_b: Floats) -> Booleans:
     """Whether straight ways from a to b cross the segments themselves."""
-    changed = (across_a < 0.0) != (across_b < 0.0)
+    changed: Booleans = (across_a < 0.0) != (across_b < 0.0)
     if not changed.any():
         return changed
     share = across_a / np.where(changed, across_a - across_b, 1.0)

@@ -58,7 +58,7 @@ class Shield:
 
     def __init__(self, config: SafetyConfig) -> None:
         self._config = config
-        self._guard = FenceGuard(config)
+        self._guard = FenceGuard(config.eroded_fence(), *config.keep_in_z())
         directions = [(scale, 0.0) for scale in SCALES]
         directions += [(math.cos(turn), sign * turn) for turn in TURNS_RAD for sign in (1, -1)]
         self._scaled = np.array([(scale * math.cos(turn), scale * math.sin(turn)) for scale, turn in directions])
@@ -166,7 +166,7 @@ class Shield:
         """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""
         x, y, z = wanted
         a, b = self._scaled[:, 0], self._scaled[:, 1]
-        rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], np.array([[0.0, 0.0, z]])]
+        rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], np.array([[0.0, 0.0, z], [0.0, 0.0, 0.0]])]
         if around.x_m.shape[0]:
             rows += [self._slid(wanted, around, stop) for stop in allowed.brake_stop_m]
         plain = np.concatenate(rows)

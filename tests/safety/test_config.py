@@ -50,6 +50,7 @@ def test_defaults_are_the_reviewed_numbers():
         "max_horizontal_speed_m_s": 1.2,
         "max_vertical_speed_m_s": 0.5,
         "max_acceleration_m_s2": 10.0,
+        "max_jerk_m_s3": 150.0,
         "max_yaw_rate_rad_s": 1.0,
         "vehicle_radius_m": 0.35,
         "vehicle_half_height_m": 0.1,
