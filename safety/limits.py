@@ -53,7 +53,7 @@ def within_limits(candidates_m_s: Floats, last: LastSent, dt_s: float, config: S
     """Which velocities [c, 3] may be sent `dt_s` after the last one: what evades an obstacle keeps to all limits too."""
     added = candidates_m_s - _towards(candidates_m_s, last.velocity, 1.0)
     change = added - _towards(added, last.acceleration, dt_s)
-    slow = np.hypot(candidates_m_s[:, 0], candidates_m_s[:, 1]) <= config.max_horizontal_speed_m_s
+    slow = np.hypot(candidates_m_s[:, 0], candidates_m_s[:, 1]) <= config.max_horizontal_speed_m_s + ROUNDING_M_S
     level = np.abs(candidates_m_s[:, 2]) <= config.max_vertical_speed_m_s
     grown = np.linalg.norm(added, axis=1) <= config.max_acceleration_m_s2 * dt_s + ROUNDING_M_S
     within: NDArray[np.bool_] = slow & level & grown & (

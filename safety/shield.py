@@ -166,7 +166,8 @@ class Shield:
         """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""
         x, y, z = wanted
         a, b = self._scaled[:, 0], self._scaled[:, 1]
-        rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], np.array([[0.0, 0.0, z], [0.0, 0.0, 0.0]])]
+        still = np.array([[0.0, 0.0, z], [0.0, 0.0, 0.0]])
+        rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], still]
         if around.x_m.shape[0]:
             rows += [self._slid(wanted, around, stop) for stop in allowed.brake_stop_m]
         plain = np.concatenate(rows)

@@ -16,10 +16,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from campaigns.adversaries.cases import Case, plan, replay
+from campaigns.adversaries.cases import MAIN, Case, plan, replay
 from campaigns.adversaries.liveness import run_liveness
 from campaigns.adversaries.pool import run_all
-from campaigns.adversaries.report import MAIN, Block, gather, heat_map, markdown, passed
+from campaigns.adversaries.report import Block, gather, heat_map, markdown, passed
 from campaigns.adversaries.trace import Trace
 
 SAVE_EVERY_S = 20.0
@@ -48,7 +48,7 @@ def campaign(chosen: argparse.Namespace) -> int:
         if time.monotonic() - saved > SAVE_EVERY_S:
             saved = time.monotonic()
             _save(out, chosen, blocks, {"partial": True})
-    liveness = run_liveness(chosen.seed)
+    liveness = run_liveness(chosen.seed, chosen.jobs)
     report = _save(out, chosen, blocks, {"wall_s": round(time.monotonic() - began), "liveness": liveness})
     heat_map(report["blocks"][MAIN], out.with_suffix(".png"))
     print(markdown(report))

@@ -15,7 +15,6 @@ from campaigns.adversaries.scenes import Scene
 from campaigns.lockstep import TICK_S, lidar_scan, vehicle_state
 from safety.config import SafetyConfig
 from safety.filter import MAX_GAP_TICKS, SafetyFilter
-from safety.frames import CorridorVector
 from safety.messages import BRAKE, LidarScan, SafeCommand, Verdict
 from sim_gateway.simulation import step_at
 from sim_gateway.vehicle import POS, VEL
@@ -58,14 +57,23 @@ class Judge:
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._config, self.outcome = scene, scene.safety, Outcome()
-        self._last, self._ticks_since = BRAKE.velocity, MAX_GAP_TICKS  # as after a pause
+        self._last, self._added = np.zeros(3), np.zeros(3)
+        self._since_s = MAX_GAP_TICKS * TICK_S  # the first command counts as one after a pause
         self._touching = self._outside = False
 
     def sent(self, command: SafeCommand, now_s: float) -> None:
         """A command leaves: is it inside every limit?"""
-        for kind in broken_limits(command, self._last, self._ticks_since * TICK_S, self._config):
+        v = command.velocity
+        velocity = np.array((v.x, v.y, v.z))
+        added = velocity - _on_the_way(velocity, self._last)
+        for kind in broken_limits(velocity, command.yaw_rate_rad_s, self._config):
             self.outcome.note(kind, now_s)
-        self._last, self._ticks_since = command.velocity, 1.0
+        if np.linalg.norm(added) > self._config.max_acceleration_m_s2 * self._since_s + ROUNDING:
+            self.outcome.note("acceleration", now_s)
+        change = added - _on_the_way(added, self._since_s * self._added)
+        if np.linalg.norm(change) > self._config.max_jerk_m_s3 * self._since_s**2 + ROUNDING:
+            self.outcome.note("jerk", now_s)
+        self._last, self._added, self._since_s = velocity, added / self._since_s, TICK_S
 
     def flown(self, place: Array, clearance_m: float, velocity: Array, now_s: float) -> None:
         """Where the vehicle is now, [3] each, and how clear of the nearest box."""
@@ -80,28 +88,23 @@ class Judge:
         self._touching, self._outside = touching, outside
 
 
-def broken_limits(command: SafeCommand, last: CorridorVector, since_s: float, config: SafetyConfig) -> list[str]:
-    """Names of the limits that a command breaks. `since_s`: time since the `last` one."""
-    v, broken = command.velocity, []
-    if not all(map(math.isfinite, (v.x, v.y, v.z, command.yaw_rate_rad_s))):
+def broken_limits(velocity: Array, yaw_rate_rad_s: float, config: SafetyConfig) -> list[str]:
+    """Names of the speed limits that a command breaks."""
+    if not (np.isfinite(velocity).all() and math.isfinite(yaw_rate_rad_s)):
         return ["not finite"]
-    if math.hypot(v.x, v.y) > config.max_horizontal_speed_m_s + ROUNDING:
-        broken.append("speed")
-    if abs(v.z) > config.max_vertical_speed_m_s + ROUNDING:
-        broken.append("vertical speed")
-    if abs(command.yaw_rate_rad_s) > config.max_yaw_rate_rad_s + ROUNDING:
-        broken.append("yaw rate")
-    if step_m_s(v, last) > config.max_acceleration_m_s2 * since_s + ROUNDING:
-        broken.append("acceleration")
-    return broken
+    checks = (
+        ("speed", math.hypot(velocity[0], velocity[1]), config.max_horizontal_speed_m_s),
+        ("vertical speed", abs(velocity[2]), config.max_vertical_speed_m_s),
+        ("yaw rate", abs(yaw_rate_rad_s), config.max_yaw_rate_rad_s),
+    )
+    return [name for name, value, limit in checks if value > limit + ROUNDING]
 
 
-def step_m_s(new: CorridorVector, last: CorridorVector) -> float:
-    """Least distance of a command to the line from standstill to the last one: slowing down along it costs nothing."""
-    a, b = np.array((new.x, new.y, new.z)), np.array((last.x, last.y, last.z))
-    length2 = float(b @ b)
-    share = min(1.0, max(0.0, float(a @ b) / length2)) if length2 > 0.0 else 0.0
-    return float(np.linalg.norm(a - share * b))
+def _on_the_way(point: Array, end: Array) -> Array:
+    """Nearest place to `point` [3] on the way from zero to `end` [3]: what is kept; slowing down along it costs nothing."""
+    length2 = float(end @ end)
+    share = min(1.0, max(0.0, float(point @ end) / length2)) if length2 > 0.0 else 0.0
+    return share * end
 
 
 Watcher = Callable[[View, SafeCommand, Verdict, Outcome], None]
@@ -122,7 +125,9 @@ class Duel:
         self._scans = 0
         self._scan = lidar_scan(self.simulation.scan(), 0)
 
-    def fly(self, policy: Policy, ticks: int, errors: Callable[[int], float] | None = None, watch: Watcher | None = None) -> Outcome:
+    def fly(
+        self, policy: Policy, ticks: int, errors: Callable[[int], float] | None = None, watch: Watcher | None = None
+    ) -> Outcome:
         """`ticks` ticks of the policy. `errors`: sign of the estimate's errors by tick, None = as the conditions say."""
         outcome = self._judge.outcome
         for tick in range(ticks):

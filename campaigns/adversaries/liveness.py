@@ -14,6 +14,7 @@ from campaigns.adversaries.disturbance import draw_conditions
 from campaigns.adversaries.flight import Duel
 from campaigns.adversaries.geometry import FenceShape
 from campaigns.adversaries.policies import FAST_M_S, View, command, towards
+from campaigns.adversaries.pool import spread
 from campaigns.adversaries.scenes import HIGH_M, Scene, told
 from campaigns.lockstep import TICK_S
 from safety.config import SafetyConfig
@@ -75,7 +76,7 @@ class Escape:
             return self.leave(view)
 
         outcome = duel.fly(policy, entered + round(self.bound_s / TICK_S))
-        return (left[0] if left else None), outcome.clearance_m > 0.0 or self.way_m == 0.0
+        return (left[0] if left else None), outcome.clearance_m > 0.0
 
 
 def _backwards(view: View) -> VelocityCommand:
@@ -96,7 +97,9 @@ def _turn_and_go(view: View) -> VelocityCommand:
 def _through(view: View) -> VelocityCommand:
     """To the middle of the gap, then on."""
     aim = 0.0 if view.place[0] < BACK_X_M + 1.0 else view.place[1]
-    return command(1.0 if abs(view.place[1]) < 0.1 or view.place[0] < 6.5 else 0.1, max(-0.5, min(0.5, aim - view.place[1])), 0.0, 0.0)
+    return command(
+        1.0 if abs(view.place[1]) < 0.1 or view.place[0] < 6.5 else 0.1, max(-0.5, min(0.5, aim - view.place[1])), 0.0, 0.0
+    )
 
 
 def _home(view: View) -> VelocityCommand:
@@ -140,9 +143,39 @@ def _escapes() -> list[Escape]:
     beside = BACK_X_M - 0.35
     return [
         *ends,
-        Escape("phantom at the hull that stays, backwards", [], (7.0, 0.0), 0.0, _backwards, _past(-1.0), 1.0, 0.0, _phantom(0.36, 99.0)),
-        Escape("phantom at the hull for 0.2 s, forwards", [], (5.0, 0.0), 0.0, _forwards, _past(2.0, 5.0), 2.0, 0.0, _phantom(0.36, 0.2)),
-        Escape("phantom inside the hull for 0.2 s, forwards", [], (5.0, 0.0), 0.0, _forwards, _past(2.0, 5.0), 2.0, 0.0, _phantom(0.2, 0.2)),
+        Escape(
+            "phantom at the hull that stays, backwards",
+            [],
+            (7.0, 0.0),
+            0.0,
+            _backwards,
+            _past(-1.0),
+            1.0,
+            0.0,
+            _phantom(0.36, 99.0),
+        ),
+        Escape(
+            "phantom at the hull for 0.2 s, forwards",
+            [],
+            (5.0, 0.0),
+            0.0,
+            _forwards,
+            _past(2.0, 5.0),
+            2.0,
+            0.0,
+            _phantom(0.36, 0.2),
+        ),
+        Escape(
+            "phantom inside the hull for 0.2 s, forwards",
+            [],
+            (5.0, 0.0),
+            0.0,
+            _forwards,
+            _past(2.0, 5.0),
+            2.0,
+            0.0,
+            _phantom(0.2, 0.2),
+        ),
         Escape("gap of 1.0 m", gap, (5.0, 0.4), 0.0, _through, lambda view: view.place[0] > BACK_X_M + 1.0, 5.0),
         Escape("start 1 cm from a wall ahead", wall, (beside - 0.01, 0.0), 0.0, _backwards, _past(-0.5, beside), 0.5),
         Escape("start 1 cm from a wall at the side", wall, (beside - 0.01, 0.0), 1.57, _backwards, _past(-0.5, beside), 0.5),
@@ -156,19 +189,29 @@ def _past(way_m: float, begin_m: float = 7.0) -> Callable[[View], bool]:
     return lambda view: (view.place[0] - begin_m) * math.copysign(1.0, way_m) > abs(way_m)
 
 
-def run_liveness(seed: int, safety: type[SafetyFilter] = SafetyFilter) -> list[dict[str, Any]]:
+ESCAPES = {escape.name: escape for escape in _escapes()}
+
+
+def fly_escape(item: tuple[str, int]) -> tuple[str, float | None, bool]:
+    """One escape by name and seed: its name, its time, whether nothing was touched."""
+    name, seed = item
+    return name, *ESCAPES[name].fly(seed)
+
+
+def run_liveness(seed: int, jobs: int) -> list[dict[str, Any]]:
     """Every escape with `SEEDS` seeds: the slowest time, and whether all were in time."""
+    flown = list(spread(fly_escape, [(name, seed + i) for name in ESCAPES for i in range(SEEDS)], jobs))
     rows = []
-    for escape in _escapes():
-        flown = [escape.fly(seed + i, safety) for i in range(SEEDS)]
-        times = [time_s for time_s, _ in flown if time_s is not None]
+    for name, escape in ESCAPES.items():
+        mine = [(time_s, clear) for its, time_s, clear in flown if its == name]
+        times = [time_s for time_s, _ in mine if time_s is not None]
         rows.append({
-            "name": escape.name,
+            "name": name,
             "flights": SEEDS,
             "left": len(times),
-            "untouched": sum(clear for _, clear in flown),
-            "slowest_s": max(times) if len(times) == SEEDS else None,
+            "untouched": sum(clear for _, clear in mine),
+            "slowest_s": round(max(times), 2) if len(times) == SEEDS else None,
             "bound_s": escape.bound_s,
-            "passed": len(times) == SEEDS and all(clear for _, clear in flown),
+            "passed": len(times) == SEEDS and all(clear for _, clear in mine),
         })  # fmt: skip
     return rows
