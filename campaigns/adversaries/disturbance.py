@@ -1,4 +1,4 @@
-"""The assumptions, held at their bounds with the worst sign: estimate errors, wind and gusts, vehicle, delays, lost beams and scans.
+"""The assumptions held at their bounds: estimate errors with the worst sign, wind, gusts, vehicle, delays, lost beams and scans.
 
 Nothing here goes beyond what docs/safety.md states; `draw_conditions` measures each drawn vehicle in its wind and takes another
 when the stop distance is longer than the filter assumes, because that would test a broken assumption.

@@ -107,6 +107,7 @@ def _on_the_way(point: Array, end: Array) -> Array:
     return share * end
 
 
+Signs = Callable[[int], float]
 Watcher = Callable[[View, SafeCommand, Verdict, Outcome], None]
 
 
@@ -125,9 +126,7 @@ class Duel:
         self._scans = 0
         self._scan = lidar_scan(self.simulation.scan(), 0)
 
-    def fly(
-        self, policy: Policy, ticks: int, errors: Callable[[int], float] | None = None, watch: Watcher | None = None
-    ) -> Outcome:
+    def fly(self, policy: Policy, ticks: int, errors: Signs | None = None, watch: Watcher | None = None) -> Outcome:
         """`ticks` ticks of the policy. `errors`: sign of the estimate's errors by tick, None = as the conditions say."""
         outcome = self._judge.outcome
         for tick in range(ticks):
@@ -147,7 +146,7 @@ class Duel:
         outcome.ticks = ticks
         return outcome
 
-    def _look(self, tick: int, now_s: float, errors: Callable[[int], float] | None) -> None:
+    def _look(self, tick: int, now_s: float, errors: Signs | None) -> None:
         """Take in the truth, disturb the estimate, and sample it."""
         view, truth = self.view, self.simulation.truth
         view.tick, view.yaw_rad = tick, truth.yaw_rad

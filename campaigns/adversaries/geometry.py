@@ -45,7 +45,7 @@ class FenceShape:
     @cached_property
     def reflex_corners(self) -> Array:
         """Vertices [r, 2] that stick into the free space: where a path can be cut short."""
-        found = [point for point in _turning(self.outer, -1.0)]
+        found = _turning(self.outer, -1.0)
         for hole in self.holes:
             found += _turning(hole, 1.0)
         return np.array(found, dtype=np.float64).reshape(-1, 2)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from campaigns.adversaries.disturbance import draw_conditions
 from campaigns.adversaries.flight import Duel
@@ -33,7 +32,7 @@ Boxes = list[tuple[float, float, float, float]]
 
 @dataclass(frozen=True)
 class Escape:
-    """A place to get out of. `enter_s`: flown by `enter` first, not timed. `out`: whether it has left; `way_m`: how far that is."""
+    """A place to get out of. `enter_s`: flown in first, not timed. `out`: whether it has left; `way_m`: how far that is."""
 
     name: str
     boxes: Boxes
@@ -96,10 +95,9 @@ def _turn_and_go(view: View) -> VelocityCommand:
 
 def _through(view: View) -> VelocityCommand:
     """To the middle of the gap, then on."""
-    aim = 0.0 if view.place[0] < BACK_X_M + 1.0 else view.place[1]
-    return command(
-        1.0 if abs(view.place[1]) < 0.1 or view.place[0] < 6.5 else 0.1, max(-0.5, min(0.5, aim - view.place[1])), 0.0, 0.0
-    )
+    x, y, _ = view.place
+    ahead = 1.0 if abs(y) < 0.1 or x < BACK_X_M - 2.5 else 0.1
+    return command(ahead, max(-0.5, min(0.5, -y)), 0.0, 0.0)
 
 
 def _home(view: View) -> VelocityCommand:
@@ -120,19 +118,19 @@ def _dead_end(deep_m: float, leave: Callable[[View], VelocityCommand], how: str)
     )  # fmt: skip
 
 
-def _phantom(range_m: float, until_s: float) -> Callable[[LidarScan, float], LidarScan]:
+def _phantom(
+    name: str, range_m: float, until_s: float, leave: Callable[[View], VelocityCommand], out: Callable[[View], bool]
+) -> Escape:
     """Returns ahead that nothing causes, in 12 degrees: too few for the sudden emptiness afterwards to be a fault."""
 
     def alter(scan: LidarScan, now_s: float) -> LidarScan:
         if now_s >= until_s:
             return scan
-        ranges: NDArray[np.float32] = scan.ranges_m.copy()
+        ranges = scan.ranges_m.copy()
         ranges[84:96] = range_m
-        return LidarScan(
-            scan.time_s, ranges, scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, scan.range_max_m, scan.sequence
-        )
+        return replace(scan, ranges_m=ranges)
 
-    return alter
+    return Escape(f"phantom {name}", [], (7.0, 0.0), 0.0, leave, out, way_m=1.0, alter=alter)
 
 
 def _escapes() -> list[Escape]:
@@ -143,39 +141,9 @@ def _escapes() -> list[Escape]:
     beside = BACK_X_M - 0.35
     return [
         *ends,
-        Escape(
-            "phantom at the hull that stays, backwards",
-            [],
-            (7.0, 0.0),
-            0.0,
-            _backwards,
-            _past(-1.0),
-            1.0,
-            0.0,
-            _phantom(0.36, 99.0),
-        ),
-        Escape(
-            "phantom at the hull for 0.2 s, forwards",
-            [],
-            (5.0, 0.0),
-            0.0,
-            _forwards,
-            _past(2.0, 5.0),
-            2.0,
-            0.0,
-            _phantom(0.36, 0.2),
-        ),
-        Escape(
-            "phantom inside the hull for 0.2 s, forwards",
-            [],
-            (5.0, 0.0),
-            0.0,
-            _forwards,
-            _past(2.0, 5.0),
-            2.0,
-            0.0,
-            _phantom(0.2, 0.2),
-        ),
+        _phantom("at the hull that stays, backwards", 0.36, 99.0, _backwards, _past(-1.0)),
+        _phantom("at the hull for 0.2 s, forwards", 0.36, 0.2, _forwards, _past(1.0)),
+        _phantom("inside the hull for 0.2 s, forwards", 0.2, 0.2, _forwards, _past(1.0)),
         Escape("gap of 1.0 m", gap, (5.0, 0.4), 0.0, _through, lambda view: view.place[0] > BACK_X_M + 1.0, 5.0),
         Escape("start 1 cm from a wall ahead", wall, (beside - 0.01, 0.0), 0.0, _backwards, _past(-0.5, beside), 0.5),
         Escape("start 1 cm from a wall at the side", wall, (beside - 0.01, 0.0), 1.57, _backwards, _past(-0.5, beside), 0.5),

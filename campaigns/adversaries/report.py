@@ -135,14 +135,7 @@ def heat_map(block: dict[str, Any], path: Path) -> None:
     image = axes.imshow(values, cmap="RdYlGn", vmin=-20.0, vmax=20.0, aspect="auto")
     for i, row in enumerate(values):
         for j, value in enumerate(row):
-            axes.text(
-                j,
-                i,
-                "" if math.isnan(value) else f"{value:.0f}" if abs(value) >= 10 else f"{value:.1f}",
-                ha="center",
-                va="center",
-                fontsize=7,
-            )
+            axes.text(j, i, "" if math.isnan(value) else f"{value:.1f}", ha="center", va="center", fontsize=6)
     axes.set_xticks(range(len(scenes)), scenes, fontsize=7, rotation=30)
     axes.set_yticks(range(len(policies)), policies, fontsize=7)
     figure.colorbar(image, label="least distance to obstacle or fence, cm")
