@@ -22,6 +22,7 @@ from sim_gateway.vehicle import POS, VEL
 Array = NDArray[np.float64]
 ROUNDING = 1e-6
 MOVING_M_S = 0.1  # passive safety: what runs into a standing vehicle is not its doing
+SETTLE_S = 10.0
 HULL_RADIUS_M, HULL_HALF_HEIGHT_M = 0.35, 0.1  # the true hull, whatever the filter is told
 
 
@@ -123,18 +124,26 @@ class Duel:
         self._judge, self.view = Judge(scene), View(scene, boxes=scene.boxes)
         self._command = self._next = SafeCommand(BRAKE.velocity, 0.0)
         self.alter: Callable[[LidarScan, float], LidarScan] | None = None
+        self._settle()
         self._scans = 0
         self._scan = lidar_scan(self.simulation.scan(), 0)
+
+    def _settle(self) -> None:
+        """Hover until the controller is used to the wind, then start from the start: a wind that begins at once is no wind."""
+        scene, simulation = self.scene, self.simulation
+        simulation.disturb((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (*self.conditions.wind_m_s, 0.0))
+        simulation.advance(step_at(SETTLE_S), (0.0, 0.0, 0.0), 0.0)
+        simulation.carry((*scene.world.start[:2], scene.height_m), scene.world.start_yaw_rad)
 
     def fly(self, policy: Policy, ticks: int, errors: Signs | None = None, watch: Watcher | None = None) -> Outcome:
         """`ticks` ticks of the policy. `errors`: sign of the estimate's errors by tick, None = as the conditions say."""
         outcome = self._judge.outcome
         for tick in range(ticks):
-            now_s = tick * TICK_S
+            now_s = SETTLE_S + tick * TICK_S
             self._look(tick, now_s, errors)
             wanted = policy(self.view)
             sent, verdict = self.filter.apply(wanted, self.view.state, self.view.scan, now_s)
-            self._judge.sent(sent, now_s)
+            self._judge.sent(sent, now_s - SETTLE_S)
             if verdict.fault is not None:
                 outcome.faults[verdict.fault] = outcome.faults.get(verdict.fault, 0) + 1
             outcome.changed += sent.velocity != wanted.velocity
@@ -156,7 +165,7 @@ class Duel:
         view.state, view.scan = vehicle_state(self.simulation.estimate(), now_s), self._altered(now_s)
 
     def _altered(self, now_s: float) -> LidarScan:
-        return self._scan if self.alter is None else self.alter(self._scan, now_s)
+        return self._scan if self.alter is None else self.alter(self._scan, now_s - SETTLE_S)
 
     def _fly_to(self, now_s: float) -> None:
         """One tick of vehicle time: the command arrives late, the next scan is taken a little before the next tick."""
@@ -172,4 +181,4 @@ class Duel:
                 self._scans += 1
                 self._scan = lidar_scan(simulation.scan(), self._scans)
             row = simulation.state_row
-            self._judge.flown(row[POS : POS + 3], simulation.clearance_m, row[VEL : VEL + 3], simulation.time_s)
+            self._judge.flown(row[POS : POS + 3], simulation.clearance_m, row[VEL : VEL + 3], simulation.time_s - SETTLE_S)

@@ -21,18 +21,15 @@ from safety.filter import SafetyFilter
 from safety.frames import CorridorVector
 from safety.messages import SafeCommand
 
-TICKS = 150
+TICKS = 100
 L_SHAPE = FenceShape(((0, 0), (4, 0), (4, 2), (2, 2), (2, 4), (0, 4)), 0.5, 3.0, (((0.5, 0.5), (1.0, 0.5), (1.0, 1.0)),))
 
 
-class OneTickLate(SafetyFilter):
-    """Sabotaged: what the policy wants goes out whenever the filter would brake."""
+class NoDelay(SafetyFilter):
+    """Sabotaged: it thinks that the vehicle follows at once."""
 
-    def apply(self, command, state, scan, now_s):
-        sent, verdict = super().apply(command, state, scan, now_s)
-        if verdict.braking and command is not None:
-            return SafeCommand(command.velocity, command.yaw_rate_rad_s), verdict
-        return sent, verdict
+    def __init__(self, config):
+        super().__init__(config.model_copy(update={"dead_time_s": 0.0, "lag_s": 0.05, "lag_min_s": 0.05}))
 
 
 def flown(case: Case, safety=SafetyFilter, ticks: int = TICKS):
@@ -50,7 +47,7 @@ def test_the_filter_withstands_a_sample_of_the_campaign(case):
     assert outcome.changed > 0  # it was attacked
 
 
-@pytest.mark.parametrize("safety", [Unfiltered, OneTickLate])
+@pytest.mark.parametrize("safety", [Unfiltered, NoDelay])
 @pytest.mark.parametrize(("scene", "kind"), [("box", "fence"), ("pillars", "contact")])
 def test_a_sabotaged_filter_is_caught(safety, scene, kind):
     found = [flown(Case(MAIN, scene, "obstacle" if scene == "pillars" else "diagonal", seed), safety).events for seed in range(2)]
@@ -62,11 +59,12 @@ def test_a_filter_that_passes_everything_breaks_every_limit():
     assert {"speed", "vertical speed", "yaw rate", "acceleration"} <= set(events)
 
 
-def test_a_case_is_flown_again_bit_for_bit(tmp_path):
+def test_a_case_is_flown_again_bit_for_bit(tmp_path, monkeypatch):
     case, trace = Case.parse("main/exclusions/smooth/11"), Trace()
+    monkeypatch.setattr("campaigns.adversaries.cases.TICKS", 80)
     first, again = run_case(case), replay(case, trace.watch)
     assert first == again
-    assert len(trace.lines()) == case.ticks + 1
+    assert len(trace.lines()) == 81
     trace.picture(tmp_path / "case.png", str(case))
     assert (tmp_path / "case.png").stat().st_size > 1000
 
@@ -133,12 +131,15 @@ def test_the_judge_counts_crossings_and_contacts_once_each():
 
 def test_the_judge_lets_braking_pass_and_counts_jumps():
     judge = Judge(make_scene("box", np.random.default_rng(0)))
-    for x, y in ((0.5, 0.0), (1.0, 0.0), (0.0, 0.0), (0.5, 0.0), (0.0, 0.6)):
+    for x, y in ((0.5, 0.0), (1.0, 0.0), (0.0, 0.0), (0.5, 0.0), (0.2, 0.0)):
         judge.sent(SafeCommand(CorridorVector(x, y, 0.0), 0.0), 0.0)
+    assert judge.outcome.events == {}
+    judge.sent(SafeCommand(CorridorVector(-0.7, 0.0, 0.0), 0.0), 0.0)
     assert judge.outcome.events == {"acceleration": 1, "jerk": 1}
 
 
-def test_report_of_a_small_campaign(tmp_path):
+def test_report_of_a_small_campaign(tmp_path, monkeypatch):
+    monkeypatch.setattr("campaigns.adversaries.cases.TICKS", 120)
     blocks: dict[str, Block] = {}
     results = [run_case(Case(MAIN, scene, "bang", 0)) for scene in ("box", "pillars")] + [
         run_case(Case(MAIN, "box", "diagonal", 0), Unfiltered)
@@ -148,7 +149,7 @@ def test_report_of_a_small_campaign(tmp_path):
     assert not passed(report)
     assert report["blocks"][MAIN]["violations"][0]["case"] == "main/box/diagonal/0"
     assert json.loads(json.dumps(report, allow_nan=False)) == report
-    assert "| main | 1,200 | 3 |" in markdown(report)
+    assert "| main | 360 | 3 |" in markdown(report)
     heat_map(report["blocks"][MAIN], tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 1000
 
