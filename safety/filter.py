@@ -14,7 +14,7 @@ from safety.caps import cap_speed
 from safety.config import SafetyConfig
 from safety.frames import CorridorVector
 from safety.lidar import BeamTable, SeenScan, see
-from safety.limits import AT_REST, limit_command, sent_after
+from safety.limits import AT_REST, limit_command, sent_after, within_limits
 from safety.memory import ObstacleMemory
 from safety.messages import BRAKE, Health, Intervention, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
 from safety.monitors import REANCHORING, InputMonitor, Judgement
@@ -103,9 +103,10 @@ class SafetyFilter:
     ) -> tuple[SafeCommand, Verdict]:
         """All inputs are fit: caps and limits, then the shield, then the gate."""
         capped, caps = cap_speed(command, judged.cap, self.config)
-        limited, limits = limit_command(capped, self._last, self._dt_s(now_s), scan.range_max_m, self.config)
+        dt_s = self._dt_s(now_s)
+        limited, limits = limit_command(capped, self._last, dt_s, scan.range_max_m, self.config)
         around = self._look(state, scan, now_s)
-        decision = self._shield.choose(limited.velocity, around)
+        decision = self._shield.choose(limited.velocity, around, lambda few: within_limits(few, self._last, dt_s, self.config))
         sent = SafeCommand(decision.velocity, limited.yaw_rate_rad_s)
         problem = gate_problem(sent, self.config)
         if problem is not None:

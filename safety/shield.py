@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ from safety.lidar import SeenScan, blind
 from safety.messages import Intervention
 
 Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
 SCALES = (0.8, 0.6, 0.4, 0.2, 0.1, 0.05)
 TURNS_RAD = tuple(math.radians(angle) for angle in (15.0, 30.0, 45.0, 60.0, 75.0, 85.0))
 PUSHES = (1.0, 1.5)  # candidates are shifted by these multiples of what leads out of a margin
@@ -61,8 +63,11 @@ class Shield:
         directions += [(math.cos(turn), sign * turn) for turn in TURNS_RAD for sign in (1, -1)]
         self._scaled = np.array([(scale * math.cos(turn), scale * math.sin(turn)) for scale, turn in directions])
 
-    def choose(self, wanted: CorridorVector, around: Surroundings) -> Decision:
-        """The wanted velocity itself when it is safe (same object), else the nearest safe candidate, else zero."""
+    def choose(self, wanted: CorridorVector, around: Surroundings, within_limits: Callable[[Floats], Booleans]) -> Decision:
+        """The wanted velocity itself when it is safe (same object), else the nearest safe candidate, else zero.
+
+        `within_limits`: which of some candidates [c, 3] may be sent at all after the command sent last.
+        """
         reach = self._reach_m(around.start)
         near = self._guard.look(around.position, around.start, reach)
         clearance, fence_margin = self._clearance_now(around), near.room_m
@@ -75,7 +80,8 @@ class Shield:
             if not found:
                 return Decision(wanted, (), clearance, fence_margin)
             return Decision(_vector(first[0]), tuple(found), clearance, fence_margin)
-        chosen = self._nearest(first[0], around, near, brake, clearance)
+        candidates = self._held_in(first[0], around, near, brake, clearance)
+        chosen = self._nearest(first[0], candidates[within_limits(candidates)], around, near, brake)
         return Decision(_vector(chosen), tuple(found), clearance, fence_margin)
 
     def _clearance_now(self, around: Surroundings) -> float:
@@ -136,25 +142,32 @@ class Shield:
             found.extend(_reasons(allowed, first[0], clear[0], fence[0]))
         return passed, allowed
 
-    def _nearest(self, wanted: Floats, around: Surroundings, near: NearFence, allowed: Allowance, clearance_m: float) -> Floats:
-        """Of all candidates that pass, the one nearest to the wanted vector [3]; zeros when none passes."""
+    def _held_in(self, wanted: Floats, around: Surroundings, near: NearFence, allowed: Allowance, clearance_m: float) -> Floats:
+        """All candidates [c, 3], turned along the fence, not too fast for where they lead."""
         brake = tubes(around.start, np.zeros((1, 3)), self._config)
         candidates = held_in(self._candidates(wanted, around, allowed), self._guard.ways_out(brake, near), self._config)
         candidates = self._view_capped(candidates, around, clearance_m, near.room_m, [])
         candidates[:, 2] = np.clip(candidates[:, 2], allowed.sink_m_s, allowed.climb_m_s)
+        return candidates
+
+    def _nearest(self, wanted: Floats, candidates: Floats, around: Surroundings, near: NearFence, allowed: Allowance) -> Floats:
+        """Of the candidates [c, 3] that pass, the one nearest to the wanted vector [3]; when none passes, horizontally none."""
+        if candidates.shape[0] == 0:
+            return allowed.hover_m_s
         tube = tubes(around.start, candidates, self._config)
         rooms = self._guard.rooms_m(tube, around.start, near)
         passed = allowed.permits(candidates, self._tube_clearances(tube, around), rooms)
         away = candidates - wanted
         cost = np.where(passed, np.einsum("ci,ci->c", away, away), math.inf)
         best = int(np.argmin(cost))
-        return candidates[best] if passed[best] else np.zeros(3)
+        return candidates[best] if passed[best] else allowed.hover_m_s
 
     def _candidates(self, wanted: Floats, around: Surroundings, allowed: Allowance) -> Floats:
         """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""
         x, y, z = wanted
         a, b = self._scaled[:, 0], self._scaled[:, 1]
-        rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], np.array([[0.0, 0.0, z]])]
+        still = np.array([[0.0, 0.0, z], [0.0, 0.0, 0.0]])
+        rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], still]
         if around.x_m.shape[0]:
             rows += [self._slid(wanted, around, stop) for stop in allowed.brake_stop_m]
         plain = np.concatenate(rows)
