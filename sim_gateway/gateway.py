@@ -202,7 +202,7 @@ class Gateway:
     def _received(self) -> list[dict[str, Any]]:
         """What moved, armed or configured the vehicle came over the wire: kind, sender, how often, first and last time."""
         found: dict[tuple[str, tuple[int, int]], list[float]] = {}
-        for item in self.server.wire_log:
+        for item in self.server.wire_log.entries:
             found.setdefault((item.what, item.sender), []).append(round(item.time_s, 3))
         return [
             {"what": what, "from": f"{sender[0]}/{sender[1]}", "count": len(times), "first_s": times[0], "last_s": times[-1]}
