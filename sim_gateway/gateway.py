@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sim_gateway.flight_report import FlightRecorder, write_json_atomically
 from sim_gateway.lidar import LidarConfig
 from sim_gateway.mavlink_server import MavlinkServer
+from sim_gateway.pace import Pace
 from sim_gateway.piloted import PilotedVehicle
 from sim_gateway.scene import Point, World
 from sim_gateway.scip import DEFAULT_PORT, ScipServer
@@ -28,7 +29,7 @@ from sim_gateway.vehicle import STEP_S
 
 # distance from the port a client listens on to the gateway's own port, as in PX4's SITL (14580 - 14540, 18570 - 14550)
 ONBOARD_PORT_OFFSET, GROUND_PORT_OFFSET = 40, 4020
-_GIVE_UP_BACKLOG_S = 0.5
+_TELL_EVERY_S = 0.2
 _MAX_STEPS_PER_TURN = 25
 _LONGEST_WAIT_S = 0.02
 
@@ -89,8 +90,9 @@ class Gateway:
         self.server = MavlinkServer(pilot, frame, self.telemetry, onboard, ground)
         self.carry: Callable[[float], tuple[Point, float]] | None = None
         self.alter_scan: Callable[[NDArray[np.float32]], NDArray[np.float32] | None] | None = None
-        self.lidar = ScipServer(lambda: self.vehicle.time_s, config.lidar_port)
-        self.dropped_s = 0.0
+        self.lidar = ScipServer(lambda: self.device_time_s, config.lidar_port)
+        self.pace = Pace(config.speed, time.monotonic())
+        self._told_s = 0.0
         self._started_s = math.nan
         self._scans = 0
         self._was_armed = False
@@ -132,20 +134,27 @@ class Gateway:
 
     def run(self, stop: threading.Event) -> None:
         """Pace vehicle time to the clock until `stop` is set or `max_time_s` of vehicle time is over, then write the report."""
-        self._started_s = origin_s = time.monotonic()
-        speed = self.config.speed
+        self._started_s = time.monotonic()
+        self.pace = Pace(self.config.speed, self._started_s)
         while not stop.is_set() and self.vehicle.time_s < self.config.max_time_s:
-            behind_s = (time.monotonic() - origin_s) * speed - self.vehicle.time_s
-            if behind_s > _GIVE_UP_BACKLOG_S * speed:
-                origin_s += behind_s / speed
-                self.dropped_s += behind_s / speed
-                _log.warning("%.2f s behind the clock: vehicle time stood still for that long", behind_s / speed)
-                behind_s = 0.0
+            behind_s = self.pace.behind_s(time.monotonic(), self.vehicle.time_s)
+            self._tell_dropped()
             for _ in range(min(int(behind_s / STEP_S), _MAX_STEPS_PER_TURN)):
                 self.step()
-            due_s = origin_s + (self.vehicle.simulation.steps + 1) * STEP_S / speed
+            due_s = self.pace.due_s((self.vehicle.simulation.steps + 1) * STEP_S)
             self._wait(due_s - time.monotonic())
         self.write_report()
+
+    @property
+    def device_time_s(self) -> float:
+        """What the LiDARs' own clocks show: they run on while vehicle time stands still."""
+        return self.vehicle.time_s + self.pace.dropped_s * self.config.speed
+
+    def _tell_dropped(self) -> None:
+        dropped_s = self.pace.dropped_s
+        if dropped_s - self._told_s >= _TELL_EVERY_S:
+            _log.warning("this computer is too slow: vehicle time stood still for %.2f s so far", dropped_s)
+            self._told_s = dropped_s
 
     def _wait(self, seconds: float) -> None:
         """Sleep until the next step is due; what arrives meanwhile is handled at once."""
@@ -163,14 +172,15 @@ class Gateway:
             vehicle.simulation.carry(*self.carry(vehicle.time_s))
         vehicle.advance(1)
         self.recorder.watch()
+        ahead = self.device_time_s - vehicle.time_s
         if self.serial_lidar is not None:
-            self.serial_lidar.advance(vehicle.simulation)
+            self.serial_lidar.advance(vehicle.simulation, ahead)
         if vehicle.simulation.steps >= step_at(self._scans * 0.05):
             self._scans += 1
             scan = vehicle.simulation.scan()
             ranges = self.alter_scan(scan.ranges_m) if self.alter_scan is not None else scan.ranges_m
             if ranges is not None:
-                self.lidar.publish(scan.time_s, ranges)
+                self.lidar.publish(scan.time_s + ahead, ranges)
                 self.telemetry.scan = replace(scan, ranges_m=ranges)
         self.server.poll()
         self._note_changes()
@@ -192,7 +202,7 @@ class Gateway:
             return
         elapsed_s = max(time.monotonic() - self._started_s, 1e-9)
         factor = round(self.vehicle.time_s / elapsed_s, 4)
-        content = self.recorder.as_dict(real_time_factor=factor, dropped_s=round(self.dropped_s, 3))
+        content = self.recorder.as_dict(real_time_factor=factor, dropped_s=round(self.pace.dropped_s, 3))
         content["received"] = self._received()
         try:
             write_json_atomically(self.config.report, content)
