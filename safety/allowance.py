@@ -142,7 +142,7 @@ def _way_out_m_s(normals: Floats, outward_m_s: Floats, config: SafetyConfig) -> 
         if not unmet.any():
             break
         active = held[:, unmet]
-        way = np.linalg.solve(active @ active.T + EPSILON_M * np.eye(2), active @ due[unmet])
+        way = np.asarray(np.linalg.solve(active @ active.T + EPSILON_M * np.eye(2), active @ due[unmet]), dtype=np.float64)
     return way * min(1.0, (config.return_speed_m_s - EPSILON_M) / max(float(np.hypot(way[0], way[1])), _LEAST_M))
 
 
