@@ -47,6 +47,8 @@ log = logging.getLogger("flight.link")
 COMMAND_DEADLINE_S = 3.0
 MODE_DEADLINE_S = 3.0
 POLL_S = 0.01
+REPORT_RATE_HZ = 10.0
+"""Of what the autopilot says about itself: often enough for the safety layer's bounds."""
 OWN_SYSTEM_ID = 245
 OWN_COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 LOOPBACK_HOSTS = ("127.0.0.1", "localhost", "::1")
@@ -63,7 +65,14 @@ class VehicleLink:
     arming and takeoff raises `ControlLostError` before anything is sent.
     """
 
-    def __init__(self, url: str, clock: Callable[[], float] = time.monotonic, *, guard_priority: int = 0) -> None:
+    def __init__(
+        self,
+        url: str,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        guard_priority: int = 0,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
         """`guard_priority`: SCHED_FIFO priority of the guard where it is permitted, 0 for usual scheduling."""
         self.url = url
         self.guard = SetpointGuard(url, guard_priority)
@@ -72,7 +81,7 @@ class VehicleLink:
         self.system_id = 0
         self.setpoints_sent = 0
         self.authority: Authority | None = None
-        self._clock = clock
+        self._clock, self._sleep = clock, sleep
         self._mavsdk: Any = None
         self._direct: Any = None
         self._action: Any = None
@@ -209,6 +218,8 @@ class VehicleLink:
         """Ask for the messages the loop lives on at `rate_hz`. Raises `VehicleCommandError` when PX4 refuses."""
         for name in ("LOCAL_POSITION_NED", "ATTITUDE", "HIGHRES_IMU"):
             self.request_message_rate(name, rate_hz)
+        for name in ("ODOMETRY", "ESTIMATOR_STATUS", "POSITION_TARGET_LOCAL_NED"):
+            self.request_message_rate(name, REPORT_RATE_HZ)
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float, keep_alive: Callable[[], None] | None = None) -> bool:
         """Poll `condition` every 10 ms until it holds (True) or `timeout_s` passed (False). Raises `GuardLostError`."""
@@ -220,7 +231,7 @@ class VehicleLink:
                 raise GuardLostError(self.guard.lost)
             if keep_alive is not None:
                 keep_alive()
-            time.sleep(POLL_S)
+            self._sleep(POLL_S)
         return True
 
     # -- setpoints ----------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from flight.authority import Authority
 from flight.errors import ExitCode, VehicleCommandError
 from flight.guard.core import Reason
+from flight.health import health_of
 from flight.interrupt import Interrupt
 from flight.lidar.driver import LidarDriver
 from flight.link import VehicleLink
@@ -72,15 +73,19 @@ class OffboardFlight:
         status: Status,
         clock: Callable[[], float] = time.monotonic,
         recorder: FlightRecorder | None = None,
+        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
+        """`clock`, `sleep`: seconds of one monotonic clock; campaigns give those of simulated time."""
         self.log = FlightLog(max_ticks=int(mission.timeouts.flight_s * LOOP_RATE_HZ) + 200)
         self.log.reserve()
-        self.keeper = RateKeeper(LOOP_RATE_HZ, clock)
+        self.keeper = RateKeeper(LOOP_RATE_HZ, clock, sleep)
         self.events: list[str] = []
         self.stall_times_s: list[float] = []
         self._link, self._lidar, self._pilot, self._frame = link, lidar, pilot, frame
         self._mission, self._interrupt, self._status, self._clock = mission, interrupt, status, clock
+        self._sleep = sleep
         self._sent_s = -math.inf
+        self._overruled = False
         self._judge = FlightJudge(mission)
         self._recorder = recorder if recorder is not None else NoRecorder()
 
@@ -96,7 +101,7 @@ class OffboardFlight:
         deadline = self._clock() + SETPOINTS_BEFORE_OFFBOARD_S
         while self._clock() < deadline:
             self.stay()
-            time.sleep(0.01)
+            self._sleep(0.01)
         self._pilot.reset()
         self._link.set_mode(FlightMode.OFFBOARD, keep_alive=self.stay)
 
@@ -143,7 +148,7 @@ class OffboardFlight:
                 due_s = min(due_s, phase_s)
         scan = self._lidar.latest()
         if scan is not None and math.isfinite(due_s):
-            time.sleep((scan.time_s + due_s - self._clock()) % (1.0 / LOOP_RATE_HZ))
+            self._sleep((scan.time_s + due_s - self._clock()) % (1.0 / LOOP_RATE_HZ))
         self.keeper.reset()
 
     def _step(self) -> Ending | None:
@@ -155,8 +160,12 @@ class OffboardFlight:
         if now_s - self._sent_s > self._mission.failsafe.stall_s:
             return self._after_stall(now_s)
         scan, state = self._lidar.latest(), self._link.state(self._frame)
-        decided = record = self._pilot.tick(scan, state, now_s)
-        if self._judge.pausing(record) and record.sent != STILL:
+        health = health_of(
+            self._link.telemetry, self._frame, self.keeper.lateness_s, self._link.authority, overruled=self._overruled
+        )
+        decided = record = self._pilot.tick(scan, state, now_s, health)
+        self._overruled = self._judge.pausing(record) and record.sent != STILL
+        if self._overruled:
             record = replace(record, sent=STILL)
         sent_s = self._link.send_velocity(record.sent, self._frame, now_s)
         if sent_s is None:  # held up since the tick began, or not ours any more
@@ -179,6 +188,7 @@ class OffboardFlight:
 
     def _after_stall(self, now_s: float) -> Ending | None:
         """The loop was held up: brake first, and look again in the next tick with samples that arrived since."""
+        self._overruled = True
         self.events.append(f"loop stalled for {now_s - self._sent_s:.2f} s")
         self._stand_still()
         self.stall_times_s.append(now_s)
@@ -225,7 +235,7 @@ class OffboardFlight:
         try:
             while self._clock() < deadline and self._link.in_control and self._link.mode == FlightMode.OFFBOARD:
                 self.stay()
-                time.sleep(0.01)
+                self._sleep(0.01)
         except VehicleCommandError as error:
             self.events.append(str(error))
 
@@ -252,8 +262,11 @@ class FlightJudge:
             self._started_s = self._best_s = record.now_s
         if record.goal_reached:
             return Ending("goal_reached", ExitCode.GOAL_REACHED, f"goal reached ({record.distance_to_goal_m:.2f} m)")
+        cause = self.escalation.cause
+        if self.escalation.level == Level.YIELD:
+            message = f"safety gave up control ({cause}): the stream stops, PX4 or the pilot has the vehicle"
+            return Ending("safety", ExitCode.SAFETY_ENDED, message, in_control=False)
         if self.escalation.level >= Level.HOLD:
-            cause = self.escalation.cause
             return Ending("safety", ExitCode.SAFETY_ENDED, f"safety ended the flight ({cause}): holding, then landing")
         return self._late(record)
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from flight.authority import Authority, ControlLostError
+from flight.conclusion import bring_down, ending_of
 from flight.errors import ExitCode, MissionError, RefusedError, VehicleCommandError
 from flight.gateway_process import GatewayProcess, GatewayReady
 from flight.guard.client import GuardLostError
@@ -55,7 +56,7 @@ from flight.results import FlightResult, judge_flight, true_distance_m, truth_fr
 from flight.setpoint_loss import set_loss_action
 from flight.shadow import ShadowFlight
 from flight.status import Status
-from flight.summary import build_summary, write_json_atomic
+from flight.summary import build_summary, fence_summary, write_json_atomic
 from flight.tether import tethered
 from flight.tick import Pilot
 from flight.trajectory import draw_trajectory_png
@@ -69,7 +70,6 @@ log = logging.getLogger("flight.session")
 HEIGHT_TOLERANCE_M = 0.5
 STILL_SPEED_M_S = 0.25
 STILL_FOR_S = 1.0
-BRAKE_S = 1.0
 ARM_RETRY_S = 0.5
 TAKEOFF_ENDS_WITHIN_M = 1.0  # PX4's default NAV_MC_ALT_RAD, 0.8 m, and the error of the estimate
 
@@ -219,28 +219,10 @@ class FlightSession:
         link.authority = Authority(link.telemetry)
         self._arm(link)
         logging.getLogger("flight").setLevel(logging.WARNING)
-        try:
-            ending = self._take_off(link, frame) or self._engage_and_run(flight)
-        except ControlLostError as error:
-            ending = Ending(_outcome(link), ExitCode.NOT_REACHED, str(error), in_control=False)
-        except GuardLostError as error:
-            ending = Ending("guard_lost", ExitCode.SAFETY_ENDED, str(error), in_control=False)
-        except VehicleCommandError as error:
-            ending = Ending("vehicle_refused", ExitCode.NOT_REACHED, str(error))
-        except Exception as error:  # armed: whatever it is, the vehicle must come down
-            log.exception("unexpected error in flight")
-            ending = Ending("internal_error", ExitCode.SAFETY_ENDED, f"{type(error).__name__}: {error}")
-        if not (ending.in_control and link.in_control):
-            link.close_stream()
-            self._status.phase(ending.message)
-            self._events += flight.events
-            return ending, link.telemetry.armed is False
+        ending = ending_of(lambda: self._take_off(link, frame) or self._engage_and_run(flight), link)
         self._status.phase(ending.message)
-        if link.mode == FlightMode.OFFBOARD:
-            flight.brake(BRAKE_S)
         landing = Landing(link, self._status, self._interrupt, self._mission.timeouts.land_s)
-        landed = landing.land(flight.stay if link.mode == FlightMode.OFFBOARD else None)
-        link.close_stream()
+        landed = bring_down(ending, link, flight, landing)
         self._events += [*flight.events, *landing.events]
         return ending, landed
 
@@ -354,7 +336,7 @@ class FlightSession:
                 "seed": self._mission.sim.seed if self._mission.sim else None,
                 "goal_m": [place.goal.x, place.goal.y, place.goal.z],
                 "goal_radius_m": self._mission.goal.radius_m,
-                "fence_m": {"min": self._mission.safety.fence.min_m, "max": self._mission.safety.fence.max_m},
+                "fence_m": fence_summary(self._mission.safety.fence),
                 "true_distance_to_goal_m": true_distance_m(report, place.goal),
                 "recording": asdict(recorded) if (recorded := self._recording.summary) is not None else None,
             },
@@ -382,7 +364,3 @@ class FlightSession:
             write_report(folder)
         except Exception as error:  # noqa: BLE001  (a picture must not turn a good landing into an error)
             log.warning("no picture or report: %s: %s; try `fly report %s`", type(error).__name__, error, folder)
-
-
-def _outcome(link: VehicleLink) -> str:
-    return link.authority.outcome if link.authority is not None else "pilot_took_over"
