@@ -66,6 +66,23 @@ class Segments:
         return distance
 
 
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Points [...] against a fence: signed margin per ring [..., r], distance to each edge and its first vertex [..., e], m."""
+
+    margin_m: Floats
+    edge_m: Floats
+    vertex_m: Floats
+
+    def room_m(self, fence: PolygonFence) -> Floats:
+        """Least room beyond the erosion [...], m."""
+        edge, vertex = self.edge_m - fence.edges.erosion_m, self.vertex_m - fence.vertices.erosion_m
+        worst = self.margin_m.min(axis=-1)
+        inside = np.minimum(edge, vertex).min(axis=-1)
+        room: Floats = np.where(worst >= 0.0, inside, worst - fence.edges.erosion_m.min())
+        return room
+
+
 class PolygonFence:
     """Inclusion and exclusion polygons as segments: `edges` ring after ring, the inclusion first, and one vertex per edge.
 
@@ -91,8 +108,7 @@ class PolygonFence:
 
     def ring_margins_m(self, points_m: Floats) -> Floats:
         """Distance of points [..., 2] to the nearest edge of each ring [..., r], negative on its forbidden side, m."""
-        margins, _ = self._margins(np.asarray(points_m, dtype=np.float64))
-        return margins
+        return self.measured(np.asarray(points_m, dtype=np.float64)).margin_m
 
     def signed_margin_m(self, points_m: Floats) -> Floats:
         """Distance of points [..., 2] to the nearest edge [...], negative outside: deepest breach of any polygon, m."""
@@ -101,25 +117,19 @@ class PolygonFence:
 
     def room_m(self, points_m: Floats) -> Floats:
         """How much further points [..., 2] are inside than the erosion asks [...], negative where too little, m."""
-        points = np.asarray(points_m, dtype=np.float64)
-        margins, edge_m = self._margins(points)
-        corner_m = self.vertices.distances_m(*self.vertices.along_across(points[..., 0], points[..., 1]))
-        inside = np.minimum((edge_m - self.edges.erosion_m).min(axis=-1), (corner_m - self.vertices.erosion_m).min(axis=-1))
-        worst = margins.min(axis=-1)
-        room: Floats = np.where(worst >= 0.0, inside, worst - self.edges.erosion_m.min())
-        return room
+        return self.measured(np.asarray(points_m, dtype=np.float64)).room_m(self)
 
-    def _margins(self, points: Floats) -> tuple[Floats, Floats]:
-        """Signed margins per ring [..., r] and distances per edge [..., e], m. Inside is an odd number of edges towards +x."""
+    def measured(self, points: Floats) -> Measured:
+        """Points [..., 2] against everything. Inside a polygon is where a way towards +x meets an odd number of its edges."""
         edges = self.edges
-        along, across = edges.along_across(points[..., 0], points[..., 1])
-        distance = edges.distances_m(along, across)
-        y = points[..., 1, None]
-        begins_below, ends_below = edges.y_m <= y, self._end_y <= y
-        crossed = (begins_below & ~ends_below & (across > 0.0)) | (~begins_below & ends_below & (across < 0.0))
+        rx, ry = points[..., 0, None] - edges.x_m, points[..., 1, None] - edges.y_m
+        across = ry * edges.ux - rx * edges.uy
+        edge = edges.distances_m(rx * edges.ux + ry * edges.uy, across)
+        begins_below, ends_below = ry >= 0.0, points[..., 1, None] >= self._end_y
+        crossed = (begins_below != ends_below) & ((across > 0.0) == begins_below) & (across != 0.0)
         enclosed = np.logical_xor.reduceat(crossed, self._first, axis=-1)
-        nearest = np.minimum.reduceat(distance, self._first, axis=-1)
-        return np.where(enclosed == self._keeps_in, nearest, -nearest), distance
+        nearest = np.minimum.reduceat(edge, self._first, axis=-1)
+        return Measured(np.where(enclosed == self._keeps_in, nearest, -nearest), edge, np.sqrt(rx * rx + ry * ry))
 
     def roomiest(self) -> Vertex | None:
         """A place with room for the vehicle, or None: cells are halved as long as room may hide in them (room is 1-Lipschitz)."""

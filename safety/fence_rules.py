@@ -83,15 +83,17 @@ def _crossed(ring: Ring) -> str | None:
 def segments_touch(first: tuple[Vertex, Vertex], second: tuple[Vertex, Vertex]) -> bool:
     """Whether two segments cross or come nearer than `LEAST_GAP_M`."""
     (a, b), (c, d) = first, second
-    if any(max(a[i], b[i]) + LEAST_GAP_M < min(c[i], d[i]) or max(c[i], d[i]) + LEAST_GAP_M < min(a[i], b[i]) for i in (0, 1)):
-        return False  # on one line but apart, rounding alone would decide below
-    if (_side(a, b, c) > 0.0) != (_side(a, b, d) > 0.0) and (_side(c, d, a) > 0.0) != (_side(c, d, b) > 0.0):
+    if _parts(a, b, c, d) and _parts(c, d, a, b):
         return True
     return min(_gap_m(a, c, d), _gap_m(b, c, d), _gap_m(c, a, b), _gap_m(d, a, b)) < LEAST_GAP_M
 
 
-def _side(a: Vertex, b: Vertex, p: Vertex) -> float:
-    return (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0])
+def _parts(a: Vertex, b: Vertex, c: Vertex, d: Vertex) -> bool:
+    """Whether c and d lie clearly on different sides of the line a - b; on it, rounding would decide and the gap must."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    far = 0.5 * LEAST_GAP_M * math.hypot(dx, dy)
+    first, second = (dx * (p[1] - a[1]) - dy * (p[0] - a[0]) for p in (c, d))
+    return min(first, second) < -far and max(first, second) > far
 
 
 def _overlap(inclusion: Ring, exclusion: Ring) -> bool:

@@ -49,20 +49,17 @@ class FenceGuard:
 
     def look(self, position: CorridorVector, start: Start, reach_m: float) -> NearFence:
         """Take what tubes from `start` can come near to when they reach `reach_m`, and all of a polygon already breached."""
-        fence, begins = self._fence, start.position_m[:, :2]
-        edges = fence.edges
-        margins = fence.ring_margins_m(begins)
-        distance = edges.distances_m(*edges.along_across(begins[:, 0], begins[:, 1]))
-        near = (distance < reach_m + fence.vertices.erosion_m[0]).any(axis=0)
-        breached: Booleans = margins.min(axis=0) < 0.0
+        fence = self._fence
+        places = np.array(((position.x, position.y), start.position_m[0, :2], start.position_m[1, :2]))
+        measured = fence.measured(places)
+        sideways = float(measured.room_m(fence)[0])
+        room = min(sideways, position.z - self._low_z, self._high_z - position.z)
+        near = measured.edge_m[1:].min(axis=0) < reach_m + fence.vertices.erosion_m[0]
+        breached = measured.margin_m[1:].min(axis=0) < 0.0
         outside = bool(breached.any())
         if outside:
-            near |= breached[edges.ring]
-        return NearFence(self._room_now_m(position), edges.taken(near), fence.vertices.taken(near), outside)
-
-    def _room_now_m(self, position: CorridorVector) -> float:
-        sideways = float(self._fence.room_m(np.array((position.x, position.y))))
-        return min(sideways, position.z - self._low_z, self._high_z - position.z)
+            near |= breached[fence.edges.ring]
+        return NearFence(room, fence.edges.taken(near), fence.vertices.taken(near), outside)
 
     def rooms_m(self, tube: Tubes, start: Start, near: NearFence) -> Floats:
         """Least room beyond the erosion of tubes at each near edge and vertex, then floor and ceiling, [c, 2 e + 2], m."""

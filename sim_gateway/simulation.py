@@ -33,7 +33,10 @@ from sim_gateway.estimate import (
     initial_error,
     step_error,
 )
+from sim_gateway.faults import Fault, FaultSchedule
 from sim_gateway.lidar import Lidar, LidarConfig
+from sim_gateway.motion_faults import MotionFaults
+from sim_gateway.scan_faults import ScanFaults
 from sim_gateway.scene import Boxes, Point, World, place_movers
 from sim_gateway.vehicle import (
     ACC,
@@ -151,7 +154,11 @@ def _read_motion(state: Array, error: Array, acceleration_error: Array, out: Arr
         out[6 + i] = state[ACC + i] + acceleration_error[i]
         out[12 + i] = state[OMEGA + i]
     roll, pitch = roll_pitch_rad(state)
-    out[9], out[10], out[11] = roll + error[ATTITUDE_ERROR], pitch + error[ATTITUDE_ERROR + 1], yaw_rad(state) + error[ATTITUDE_ERROR + 2]
+    out[9], out[10], out[11] = (
+        roll + error[ATTITUDE_ERROR],
+        pitch + error[ATTITUDE_ERROR + 1],
+        yaw_rad(state) + error[ATTITUDE_ERROR + 2],
+    )
 
 
 class SensorNoise:
@@ -216,6 +223,9 @@ class Simulation:
         self._sensors = [SensorNoise(np.random.SeedSequence([seed, 1, i]).generate_state(2, np.uint64)) for i in range(2)]
         self._start_errors(estimate_preset(estimate) if isinstance(estimate, str) else estimate)
         self._start_wind(wind)
+        self.faults = FaultSchedule()
+        self.motion_faults = MotionFaults(self.faults)
+        self._scan_faults = ScanFaults(self.faults, seed)
         self._log = np.array([math.inf, 0.0, 0.0, 0.0])
         _watch_clearance(self._boxes, self._state, contact_radius_m, self._log)
 
@@ -231,6 +241,10 @@ class Simulation:
         self._wind_mean = np.array(wind.mean_m_s, dtype=np.float64)
         self._gust = wind.gust_sigma_m_s * self._generator.standard_normal(3)
         self._gust_coefficients = np.array([decay, wind.gust_sigma_m_s * math.sqrt(1.0 - decay * decay)])
+
+    def inject(self, fault: Fault) -> None:
+        """Let something go wrong; see `sim_gateway.faults`. Faults of links and reports need the gateway around this."""
+        self.faults.add(fault)
 
     # time
 
@@ -272,11 +286,23 @@ class Simulation:
     def _step(self, n_steps: int, setpoint: Array, yaw_rate_sp: float, *, motors_on: bool) -> None:
         if not 0 <= n_steps <= MAX_STEPS_PER_CALL:
             raise ValueError(f"n_steps is {n_steps}: it must lie in 0..{MAX_STEPS_PER_CALL}")
+        if not self.motion_faults.any:
+            self._step_alike(n_steps, setpoint, yaw_rate_sp, self._params, self._wind_mean, motors_on=motors_on)
+            return
+        faults, end = self.motion_faults, self.steps + n_steps
+        while self.steps < end:
+            now_s, steps = self.time_s, faults.steps_alike(self.steps, end - self.steps)
+            params, wind = faults.params(self._params, now_s), self._wind_mean + faults.wind(now_s)
+            self._step_alike(steps, faults.setpoint(setpoint, now_s), yaw_rate_sp, params, wind, motors_on=motors_on)
+
+    def _step_alike(
+        self, n_steps: int, setpoint: Array, yaw_rate_sp: float, params: Array, wind_mean: Array, *, motors_on: bool
+    ) -> None:
         normals = self._generator.standard_normal((n_steps, _NORMALS))
         _advance(
-            *(self._state, self._params, setpoint, yaw_rate_sp, motors_on, normals, self.steps),
+            *(self._state, params, setpoint, yaw_rate_sp, motors_on, normals, self.steps),
             *(self._boxes, len(self.world.static_boxes), self.world.mover_rows),
-            *(self._error, self._coefficients, self._wind_mean, self._gust, self._gust_coefficients),
+            *(self._error, self._coefficients, wind_mean, self._gust, self._gust_coefficients),
             *(self.contact_radius_m, self._log),
         )
         self.steps += n_steps
@@ -293,16 +319,24 @@ class Simulation:
 
         Without `acceleration_noise` the acceleration is the true one: quicker, for readers that have no use for it.
         """
-        if not acceleration_noise:
-            return self._motion(self._error, _NO_NOISE)
-        noise = self._sensors[_ACCELERATION_STREAM].at(self.steps).standard_normal(3)
-        return self._motion(self._error, self._acceleration_sigma * noise)
+        motion = self._motion(self._error, self._acceleration_error() if acceleration_noise else _NO_NOISE)
+        return self.motion_faults.estimate(motion) if self.motion_faults.any else motion
+
+    def _acceleration_error(self) -> Array:
+        if not self._acceleration_sigma.any():
+            return _NO_NOISE
+        return self._acceleration_sigma * self._sensors[_ACCELERATION_STREAM].at(self.steps).standard_normal(3)
 
     def _motion(self, error: Array, acceleration_error: Array) -> Motion:
         _read_motion(self._state, error, acceleration_error, self._reading)
         x, y, z, vx, vy, vz, ax, ay, az, roll, pitch, heading, p, q, r = self._reading.tolist()
         yaw = math.remainder(heading, 2.0 * math.pi)
         return Motion(self.time_s, (x, y, z), (vx, vy, vz), (ax, ay, az), roll, pitch, yaw, (p, q, r))
+
+    @property
+    def truth_position_m(self) -> Point:
+        """Where the vehicle really is."""
+        return _triple(self._state[POS : POS + 3])
 
     @property
     def landed(self) -> bool:
@@ -312,7 +346,7 @@ class Simulation:
     @property
     def wind_m_s(self) -> Point:
         """The wind now."""
-        return _triple(self._wind_mean + self._gust)
+        return _triple(self._wind_mean + self._gust + self.motion_faults.wind(self.time_s))
 
     @property
     def state_row(self) -> Array:
@@ -333,6 +367,10 @@ class Simulation:
         config = self._lidar.config
         angles = (config.angle_min_rad, config.angle_increment_rad)
         return Scan(self.time_s, ranges.astype(np.float32), *angles, config.range_min_m, config.range_max_m)
+
+    def device_scans(self) -> list[Scan]:
+        """What leaves the scanner at its scan time now: the scan it measured, or what LiDAR faults make of it. Once per scan."""
+        return self._scan_faults.pass_on(self.scan())
 
     def boxes(self) -> Boxes:
         """All boxes where they are now, static ones first: a copy, float64 [m, 6]."""
