@@ -283,7 +283,7 @@ def test_same_input_gives_the_same_output_also_after_reset(boxes, commands):
 @quick
 def test_commands_grow_and_turn_no_faster_than_the_acceleration_limit(commands):
     """Away from obstacles. Slowing down along the last command is free; what is added is bounded."""
-    safety, last = SafetyFilter(config(max_acceleration_m_s2=2.0, blind_speed_m_s=1.0)), np.zeros(3)
+    safety, last = SafetyFilter(config(max_acceleration_m_s2=2.0)), np.zeros(3)
     for k, wanted in enumerate(commands):
         time_s = 0.05 * k
         sent, _ = safety.apply(command(*wanted), state(x=X0, time_s=time_s), scan(time_s=time_s), time_s)

@@ -1,0 +1,71 @@
+"""How much unseen space a brake tube leads through, compared with what braking itself would need.
+
+A command may lead through no unseen cell, or, when braking itself does (start in the unseen, drift, memory run out), through no
+more than braking. Counted with one cell to spare, so that the grid's own steps do not count as a breach: only the exact count
+slows down.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safety.braking import Tubes
+from safety.config import SafetyConfig
+from safety.frames import CorridorVector
+from safety.free_space import STEP_M, FreeSpace
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.intp]
+Booleans = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The map of free space at a moment, and the known returns [2, k] near the vehicle."""
+
+    free: FreeSpace
+    near_m: Floats
+    now_s: float
+
+    def beside(self, near_m: Floats) -> View:
+        """The same with other returns."""
+        return View(self.free, near_m, self.now_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Hidden:
+    """Unseen cells on tubes [c], at the worst place of each: with one cell to spare, and exactly (0 where `wide` is)."""
+
+    wide: Integers
+    exact: Integers
+
+    def permits(self, others: Hidden) -> Booleans:
+        """Which tubes lead through no more than this one."""
+        permitted: Booleans = (others.wide <= self.wide) & (others.exact <= self.exact)
+        return permitted
+
+
+class Sight:
+    """Counts unseen cells under the hull."""
+
+    def __init__(self, config: SafetyConfig) -> None:
+        longest = config.stop_distance_m(2.0 * config.max_horizontal_speed_m_s)
+        self._shares = np.linspace(0.0, 1.0, math.ceil(longest / STEP_M) + 1)
+
+    def lost(self, position: CorridorVector, view: View) -> bool:
+        """Whether the vehicle is in unseen space."""
+        x, y = np.array((position.x,)), np.array((position.y,))
+        return bool(view.free.unseen(x, y, view.near_m, view.now_s, wide=False)[0])
+
+    def hidden(self, tube: Tubes, view: View) -> Hidden:
+        """The unseen cells on each tube, of both models."""
+        leg = tube.stop_m - tube.turn_m
+        x, y = (tube.turn_m[..., axis, None] + leg[..., axis, None] * self._shares for axis in (0, 1))
+        wide = view.free.unseen(x, y, view.near_m, view.now_s, wide=True).max(axis=(0, 2))
+        if not wide.any():
+            return Hidden(wide, wide)
+        return Hidden(wide, view.free.unseen(x, y, view.near_m, view.now_s, wide=False).max(axis=(0, 2)))
