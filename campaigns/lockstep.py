@@ -123,6 +123,8 @@ class LockstepFlight:
         """Sample, tick, and put the command on its way. Vehicle time stands at `now_s` before and after."""
         record = self.pilot.tick(self._latest, vehicle_state(self.simulation.estimate(), now_s), now_s)
         self.log.append(record, now_s)
+        if braking:
+            self.pilot.pause(now_s)
         self._next = SafeCommand(BRAKE.velocity, 0.0) if braking else record.sent
         return record
 
@@ -152,8 +154,7 @@ class LockstepFlight:
         if self.simulation.contacts and watch.first_contact is None:
             watch.first_contact = self._what_was_hit(truth)
         fence = self.config.safety.fence
-        inside = all(low <= x <= high for low, x, high in zip(fence.min_m, truth.position_m, fence.max_m, strict=True))
-        watch.left_fence = watch.left_fence or not inside
+        watch.left_fence = watch.left_fence or fence.margin_m(*truth.position_m) < 0.0
 
     def _what_was_hit(self, truth: Motion) -> str:
         boxes, fixed = self.simulation.boxes(), len(self.world.static_boxes)

@@ -154,6 +154,7 @@ class OffboardFlight:
         decided = record = self._pilot.tick(scan, state, now_s)
         if self._judge.pausing(record) and record.sent != STILL:
             record = replace(record, sent=STILL)
+            self._pilot.pause(now_s)
         if self._clock() - self._sent_s > self._loss_certain_s:  # held up since the tick began
             self._record(decided, scan, state, None)
             return self._after_stall(self._clock())

@@ -128,6 +128,8 @@ def replayed(recording: Recording, policy: PolicyRunner) -> Iterator[tuple[TickS
             return
         pilot.set_goal(sample.goal)
         yield sample, pilot.tick(sample.scan, sample.state, sample.record.now_s)
+        if sample.sent is not None and sample.sent != sample.record.sent:
+            pilot.pause(sample.record.now_s)
 
 
 def compare(recording: Recording, tolerance: float = 0.0) -> Comparison:

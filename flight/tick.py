@@ -93,6 +93,10 @@ class Pilot:
             self.goal = goal
             self._policy.reset("goal_change")
 
+    def pause(self, now_s: float) -> None:
+        """Be told that zero velocity went out at `now_s` in place of what `tick` decided: the filter counts what is in flight."""
+        self._safety.pause(now_s)
+
     def tick(self, scan: LidarScan | None, state: VehicleState | None, now_s: float) -> TickRecord:
         """One step of the whole stack at `now_s`. Never raises for bad samples: they end in a braking command."""
         known = state if _usable(state) else None

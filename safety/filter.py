@@ -16,7 +16,7 @@ from safety.config import SafetyConfig
 from safety.frames import CorridorVector
 from safety.free_space import FreeSpace
 from safety.lidar import BeamTable, SeenScan, see
-from safety.limits import limit_command
+from safety.limits import AT_REST, limit_command, sent_after
 from safety.memory import ObstacleMemory
 from safety.messages import BRAKE, Intervention, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
 from safety.monitors import InputMonitor
@@ -52,7 +52,7 @@ class SafetyFilter:
         self._history.clear()
         self._memory.clear()
         self._free.clear()
-        self._last = BRAKE.velocity
+        self._last = AT_REST
         self._last_time_s: float | None = None
         self._seen: SeenScan | None = None
         self.last_error = None
@@ -109,12 +109,19 @@ class SafetyFilter:
         longest = MAX_GAP_TICKS * self.config.tick_s
         return longest if self._last_time_s is None else min(now_s - self._last_time_s, longest)
 
+    def pause(self, now_s: float) -> None:
+        """Be told that zero velocity was sent at `now_s`, in place of what `apply` returned (the escalation does that)."""
+        self._remember(SafeCommand(BRAKE.velocity, BRAKE.yaw_rate_rad_s), now_s)
+        self._last = AT_REST
+
     def _remember(self, sent: SafeCommand, now_s: float) -> None:
         """Add what was sent to the commands in flight. A clock that is not usable adds nothing."""
-        self._last = sent.velocity
+        dt_s = self.config.tick_s
         if math.isfinite(now_s) and (self._last_time_s is None or now_s >= self._last_time_s):
+            dt_s = max(self._dt_s(now_s), dt_s)
             self._last_time_s = now_s
             self._history.add(now_s, sent.velocity)
+        self._last = sent_after(self._last, sent.velocity, dt_s)
 
 
 def gate_problem(sent: SafeCommand, config: SafetyConfig) -> Intervention | None:

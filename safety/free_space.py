@@ -1,7 +1,7 @@
 """Which places were recently seen free: a map of cells around the vehicle, in fixed space.
 
-A cell counts as seen when a scan's beams went through all of it, or the vehicle itself was there; what was never seen, or too long
-ago, is not free. Cells near a known return belong to that return, whose distance is checked to the millimetre elsewhere.
+A cell counts as seen when a scan's beams went through all of it, or the vehicle itself was there; what was never seen, or too
+long ago, is not free. Cells near a known return belong to that return, whose distance is checked to the millimetre elsewhere.
 Obstacles count as columns, so the map is flat. With moving obstacles the unseen grows into the seen at their speed.
 """
 
@@ -24,7 +24,7 @@ SIDE_CELLS = 128
 CARVE_M = 2.5  # a scan is taken in up to this far: a brake tube and the hull need less
 RECENTRE_CELLS = 8  # the map follows the vehicle in steps of this size
 SURFACE_CELLS = 2  # cells this near to a known return belong to it
-TAKE_OFF_M = 0.8  # at engaging nothing may stand nearer to the vehicle's centre than this, unseen by the LiDAR
+TAKE_OFF_M = 0.9  # at engaging nothing may stand nearer to the vehicle's centre than this, unseen by the LiDAR
 VICINITY_CELLS = 2  # around the swept hull: what is known there stays known while the vehicle stands
 STEP_M = 0.2  # between the discs that stand for a swept hull
 _REACH_ERROR_M = CELL_M * math.sqrt(2.0)  # of a cell's far corner, seen from anywhere in the cell of the LiDAR
@@ -56,7 +56,7 @@ class FreeSpace:
         """Take in a scan: what its beams went through, and where the vehicle is."""
         if self._began_s is None:
             self._began_s, self._shrunk_s = seen.time_s, seen.time_s
-            self._corner = tuple(_cell(p) - SIDE_CELLS // 2 for p in (seen.origin_x_m, seen.origin_y_m))
+            self._corner = (_cell(seen.origin_x_m) - SIDE_CELLS // 2, _cell(seen.origin_y_m) - SIDE_CELLS // 2)
             own = _disc(TAKE_OFF_M)
         else:
             self._follow(seen.origin_x_m, seen.origin_y_m)
@@ -232,9 +232,7 @@ def _disc(radius_m: float) -> Integers:
 def _boxes(radius_m: float) -> Integers:
     """Half sides [b, 2], in cells, of boxes that together are all cells within a radius of any point of the middle cell."""
     reach = radius_m / CELL_M
-    widths = [
-        (i, 1 + math.floor(math.sqrt(reach * reach - max(i - 1, 0) ** 2))) for i in range(math.floor(reach) + 2)
-    ]
+    widths = [(i, 1 + math.floor(math.sqrt(reach * reach - max(i - 1, 0) ** 2))) for i in range(math.floor(reach) + 2)]
     corners = [box for box, after in zip(widths, [*widths[1:], (0, -1)], strict=True) if after[1] < box[1]]
     return np.array(corners)
 

@@ -15,7 +15,9 @@ from safety.lidar import SeenScan, scan_offset
 
 Floats = NDArray[np.float64]
 CAPACITY = 2048
-MOVED_S = 1.0  # so long a point spreads at the obstacles' speed; after that the unseen that grows into the map of free space holds
+MOVED_S = (
+    1.0  # so long a point spreads at the obstacles' speed; after that the unseen that grows into the map of free space holds
+)
 SAME_PLACE_M = 0.2  # a return this close to a remembered one, along its beam, is the same thing seen again
 
 

@@ -12,14 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from safety.allowance import EPSILON_M, Allowance, allowance
+from safety.allowance import EPSILON_M, Allowance, allowance, held_in
 from safety.braking import Start, Tubes, slow_after_s, tubes
 from safety.config import SafetyConfig
+from safety.fence_tube import FenceGuard, NearFence
 from safety.frames import CorridorVector
 from safety.messages import Intervention
 from safety.sight import Hidden, Sight, View
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.intp]
 SCALES = (0.8, 0.6, 0.4, 0.2, 0.1, 0.05)
 TURNS_RAD = tuple(math.radians(angle) for angle in (15.0, 30.0, 45.0, 60.0, 75.0, 85.0))
 PUSHES = (1.0, 1.5)  # candidates are shifted by these multiples of what leads out of a margin
@@ -40,6 +42,14 @@ class Surroundings:
 
 
 @dataclass(frozen=True, slots=True)
+class Bounds:
+    """What braking sets for all commands of a tick: clearances and speeds, and the unseen space on its way."""
+
+    allowed: Allowance
+    hidden: Hidden
+
+
+@dataclass(frozen=True, slots=True)
 class Decision:
     """The chosen velocity, and why it is not the wanted one. `clearance_m`: now, hull to nearest known point."""
 
@@ -55,25 +65,26 @@ class Shield:
     def __init__(self, config: SafetyConfig) -> None:
         self._config = config
         self._sight = Sight(config)
-        low, high = config.keep_in()
-        self._low, self._high = np.array(low), np.array(high)
+        self._guard = FenceGuard(config.eroded_fence(), *config.keep_in_z())
         directions = [(scale, 0.0) for scale in SCALES]
         directions += [(math.cos(turn), sign * turn) for turn in TURNS_RAD for sign in (1, -1)]
         self._scaled = np.array([(scale * math.cos(turn), scale * math.sin(turn)) for scale, turn in directions])
 
     def choose(self, wanted: CorridorVector, around: Surroundings) -> Decision:
         """The wanted velocity itself when it is safe (same object), else the nearest safe candidate, else zero."""
-        clearance, fence_margin = self._clearance_now(around), self._fence_margin(around.position)
-        around = self._within_reach(around)
+        reach = self._reach_m(around.start)
+        near = self._guard.look(around.position, around.start, reach)
+        clearance, fence_margin = self._clearance_now(around), near.room_m
+        around = self._within_reach(around, reach)
         limit = self._speed_limit(around, clearance, fence_margin)
         first = np.array(((wanted.x, wanted.y, wanted.z), (0.0, 0.0, 0.0)))
         speed = math.hypot(wanted.x, wanted.y)
         found = [Intervention("return_speed", speed, limit)] if speed > limit else []
         first = _capped(first, limit)
-        passed, brake, hidden = self._judge(first, around, found)
+        passed, bounds = self._judge(first, around, near, found)
         if passed and not found:
             return Decision(wanted, (), clearance, fence_margin)
-        chosen = first[0] if passed else self._nearest(first[0], around, brake, hidden, limit)
+        chosen = first[0] if passed else self._nearest(first[0], around, near, bounds, limit)
         return Decision(_vector(chosen), tuple(found), clearance, fence_margin)
 
     def _speed_limit(self, around: Surroundings, clearance_m: float, fence_margin_m: float) -> float:
@@ -89,58 +100,67 @@ class Shield:
         dx, dy = around.x_m - around.position.x, around.y_m - around.position.y
         return math.sqrt(float(np.min(dx * dx + dy * dy))) - self._config.vehicle_radius_m
 
-    def _within_reach(self, around: Surroundings) -> Surroundings:
-        """Only the points that some tube of this tick can come near to: the others cannot change a decision."""
-        config, start = self._config, around.start
+    def _reach_m(self, start: Start) -> float:
+        """How far from `start` some tube of this tick can come, errors and keep-out included, m."""
+        config = self._config
         fast = (
             max(math.hypot(v[0], v[1]) for v in start.velocity_m_s)
             + config.max_horizontal_speed_m_s * config.tick_s / config.lag_min_s
         )
         apart = math.dist(start.position_m[0, :2], start.position_m[1, :2])
-        errors = config.velocity_error_m_s * config.delay_s
-        errors += config.obstacle_speed_m_s * (config.dead_time_s + config.tick_s + float(slow_after_s(fast * config.lag_s, config)))
-        reach = (
-            config.keep_out_m + apart + errors + config.stop_distance_m(fast + config.max_horizontal_speed_m_s * config.tick_s)
-        )
+        blind_s = config.dead_time_s + config.tick_s + float(slow_after_s(fast * config.lag_s, config))
+        errors = config.velocity_error_m_s * config.delay_s + config.obstacle_speed_m_s * blind_s
+        stop = config.stop_distance_m(fast + config.max_horizontal_speed_m_s * config.tick_s)
+        return config.keep_out_m + apart + errors + stop
+
+    def _within_reach(self, around: Surroundings, reach_m: float) -> Surroundings:
+        """Only the points that some tube of this tick can come near to: the others cannot change a decision."""
+        start = around.start
         dx, dy = around.x_m - start.position_m[0, 0], around.y_m - start.position_m[0, 1]
-        near = dx * dx + dy * dy < (reach + around.extra_m) ** 2
+        near = dx * dx + dy * dy < (reach_m + around.extra_m) ** 2
         x, y = around.x_m[near], around.y_m[near]
         return Surroundings(x, y, around.extra_m[near], around.view.beside(np.array((x, y))), around.position, around.start)
 
-    def _fence_margin(self, position: CorridorVector) -> float:
-        """Smallest distance of the vehicle's centre to a face of the eroded fence, negative outside, m."""
-        p = (position.x, position.y, position.z)
-        return float(min(min(p[i] - self._low[i], self._high[i] - p[i]) for i in range(3)))
-
-    def _judge(self, first: Floats, around: Surroundings, found: list[Intervention]) -> tuple[bool, Allowance, Hidden]:
-        """Judge the wanted command (row 0) against the allowance that braking (row 1) sets."""
+    def _judge(self, first: Floats, around: Surroundings, near: NearFence, found: list[Intervention]) -> tuple[bool, Bounds]:
+        """Judge the wanted command (row 0) against what braking (row 1) sets."""
         tube = tubes(around.start, first, self._config)
-        clear, fence = self._tube_clearances(tube, around), self._tube_fence(tube)
-        points, position = around.view.near_m, np.array((around.position.x, around.position.y))
-        allowed = allowance(tube, clear[1], fence[1], points, position, self._config)
+        clear, fence = self._tube_clearances(tube, around), self._guard.rooms_m(tube, around.start, near)
+        position = np.array((around.position.x, around.position.y))
+        ways = self._guard.ways_out(tube, near) if (fence[1, :-2] < 0.0).any() else None
+        allowed = allowance(tube, clear[1], fence[1], around.view.near_m, position, ways, self._config)
+        hidden = self._sight.hidden(tube, around.view)
+        bounds = Bounds(allowed, hidden.rows(slice(1, 2)))
         if not allowed.permits(first[:1], clear[:1], fence[:1])[0]:
             found.extend(_reasons(allowed, first[0], clear[0], fence[0]))
-            return False, allowed, self._sight.hidden(tube.rows(slice(1, 2)), around.view)
-        wanted, brake = self._sight.hidden(tube.rows(slice(0, 1)), around.view), self._sight.hidden(tube.rows(slice(1, 2)), around.view)
-        if not brake.permits(wanted)[0]:
-            found.append(Intervention("unseen", float(wanted.wide[0]), float(brake.wide[0])))
-            return False, allowed, brake
-        return True, allowed, brake
+            return False, bounds
+        if not bounds.hidden.permits(hidden)[0]:
+            found.append(Intervention("unseen", float(hidden.wide[0]), float(hidden.wide[1])))
+            return False, bounds
+        return True, bounds
 
-    def _nearest(self, wanted: Floats, around: Surroundings, allowed: Allowance, brake: Hidden, limit_m_s: float) -> Floats:
+    def _nearest(self, wanted: Floats, around: Surroundings, near: NearFence, bounds: Bounds, limit_m_s: float) -> Floats:
         """Of all candidates that pass, the one nearest to the wanted vector [3]; zeros when none passes."""
-        candidates = allowed.clipped(_capped(self._candidates(wanted, around, allowed), limit_m_s))
+        allowed, brake = bounds.allowed, tubes(around.start, np.zeros((1, 3)), self._config)
+        candidates = held_in(self._candidates(wanted, around, allowed), self._guard.ways_out(brake, near), self._config)
+        candidates = _capped(candidates, limit_m_s)
+        candidates[:, 2] = np.clip(candidates[:, 2], allowed.sink_m_s, allowed.climb_m_s)
         away = candidates - wanted
         candidates = candidates[np.argsort(np.einsum("ci,ci->c", away, away), kind="stable")]
         for few in (candidates[:FIRST_LOOK], candidates[FIRST_LOOK:]):
-            tube = tubes(around.start, few, self._config)
-            passed = np.flatnonzero(allowed.permits(few, self._tube_clearances(tube, around), self._tube_fence(tube)))
-            if passed.shape[0]:
-                passed = passed[brake.permits(self._sight.hidden(tube.rows(passed), around.view))]
+            passed = self._passing(few, around, near, bounds)
             if passed.shape[0]:
                 nearest: Floats = few[passed[0]]
                 return nearest
         return np.zeros(3)
+
+    def _passing(self, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Integers:
+        """Indices of the candidates [c, 3] that keep to the bounds; unseen space is counted only for those that pass all else."""
+        tube = tubes(around.start, candidates, self._config)
+        rooms = self._guard.rooms_m(tube, around.start, near)
+        passed = np.flatnonzero(bounds.allowed.permits(candidates, self._tube_clearances(tube, around), rooms))
+        if passed.shape[0] == 0:
+            return passed
+        return passed[bounds.hidden.permits(self._sight.hidden(tube.rows(passed), around.view))]
 
     def _candidates(self, wanted: Floats, around: Surroundings, allowed: Allowance) -> Floats:
         """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""
@@ -165,11 +185,6 @@ class Shield:
         inward, length = min(0.0, float(wanted @ normal)), math.hypot(wanted[0], wanted[1])
         return np.stack([wanted - (inward - share * length) * normal for share in OUTWARD])
 
-    def _tube_fence(self, tube: Tubes) -> Floats:
-        """Smallest distance inside each face of the eroded fence over a tube's corners, [c, 6], negative outside, m."""
-        corners = np.concatenate((tube.turn_m, tube.stop_m))
-        return np.concatenate(((corners - self._low).min(axis=0), (self._high - corners).min(axis=0)), axis=1)
-
     def _tube_clearances(self, tube: Tubes, around: Surroundings) -> Floats:
         """Smallest distance beyond keep-out between each tube and each known point, [c, k], m."""
         config, error = self._config, self._config.velocity_error_m_s
@@ -186,7 +201,7 @@ def _reasons(allowed: Allowance, wanted: Floats, clear_m: Floats, fence_m: Float
     """Which rules refuse the wanted command [3], each at its worst place."""
     reasons: list[Intervention] = []
     face = int(np.argmin(fence_m - allowed.fence_m))
-    outside = float(np.maximum(allowed.low_m_s - wanted, wanted - allowed.high_m_s).max()) > EPSILON_M
+    outside = max(allowed.sink_m_s - wanted[2], wanted[2] - allowed.climb_m_s) > EPSILON_M
     if outside or fence_m[face] < allowed.fence_m[face] - EPSILON_M:
         reasons.append(Intervention("fence", float(fence_m[face]), float(allowed.fence_m[face])))
     if clear_m.shape[0]:

@@ -1,7 +1,7 @@
 """How much unseen space a brake tube leads through, compared with what braking itself would need.
 
-A command may lead through no unseen cell, or, when braking itself does (start in the unseen, drift, memory run out), through no more
-than braking. Counted with one cell to spare, so that the grid's own steps do not count as a breach: only the exact count slows down.
+A command may lead through no unseen cell, or, when braking itself does (start in the unseen, drift, memory run out), through no
+more than braking. Counted with one cell to spare, so that the grid's own steps are no breach: only the exact count slows down.
 """
 
 from __future__ import annotations
@@ -41,6 +41,10 @@ class Hidden:
 
     wide: Integers
     exact: Integers
+
+    def rows(self, chosen: slice) -> Hidden:
+        """The counts of some tubes."""
+        return Hidden(self.wide[chosen], self.exact[chosen])
 
     def permits(self, others: Hidden) -> Booleans:
         """Which tubes lead through no more than this one."""

@@ -33,6 +33,9 @@ class RecordedPilot:
     def reset(self) -> None:
         self._pilot.reset()
 
+    def pause(self, now_s: float) -> None:
+        self._pilot.pause(now_s)
+
     def tick(self, scan: LidarScan | None, state: VehicleState | None, now_s: float) -> TickRecord:
         record = self._pilot.tick(scan, state, now_s)
         self.records.append(record)
