@@ -21,7 +21,7 @@ from policy_export.runner import PolicyRunner
 from safety.config import SafetyConfig
 from safety.filter import SafetyFilter
 from safety.frames import CorridorVector
-from safety.messages import BRAKE, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
+from safety.messages import BRAKE, Health, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
 from sim_gateway.collision import clearance_m
 from sim_gateway.lidar import LidarConfig
 from sim_gateway.paths import shortest_path_length
@@ -30,6 +30,7 @@ from sim_gateway.simulation import Motion, Scan, Simulation, WindConfig, step_at
 from sim_gateway.vehicle import STEP_S
 
 TICK_S = 0.05
+_OVERRULED = Health(overruled=True, inference_s=0.0)  # zero was sent last; the computer's own times are not judged here
 BRAKE_AFTER_GOAL_S = 1.0
 """As `fly` does on arrival, before it asks the autopilot to hold."""
 SUCCESS_RADIUS_M = 0.3
@@ -63,7 +64,12 @@ class Unfiltered(SafetyFilter):
     """Stands where the safety filter stands, and passes everything: only to measure what the filter costs and saves."""
 
     def apply(
-        self, command: VelocityCommand | None, state: VehicleState | None, scan: LidarScan | None, now_s: float
+        self,
+        command: VelocityCommand | None,
+        state: VehicleState | None,
+        scan: LidarScan | None,
+        now_s: float,
+        health: Health | None = None,
     ) -> tuple[SafeCommand, Verdict]:
         """The command as it is; BRAKE without one."""
         wanted = command or BRAKE
@@ -101,6 +107,7 @@ class LockstepFlight:
         self._scans = 0
         self._take_scan()
         self._watch = _Watch()
+        self._braked = False
 
     def run(self) -> EpisodeResult:
         """Fly until the goal (and one second of braking) or until the time is up; contacts are counted and flown through."""
@@ -121,10 +128,10 @@ class LockstepFlight:
 
     def _tick(self, now_s: float, *, braking: bool) -> TickRecord:
         """Sample, tick, and put the command on its way. Vehicle time stands at `now_s` before and after."""
-        record = self.pilot.tick(self._latest, vehicle_state(self.simulation.estimate(), now_s), now_s)
+        health = _OVERRULED if self._braked else None
+        record = self.pilot.tick(self._latest, vehicle_state(self.simulation.estimate(), now_s), now_s, health)
         self.log.append(record, now_s)
-        if braking:
-            self.pilot.pause(now_s)
+        self._braked = braking
         self._next = SafeCommand(BRAKE.velocity, 0.0) if braking else record.sent
         return record
 

@@ -27,6 +27,8 @@ SLIDE_SHARE = 0.25  # of the margin: how far inside points may be neared, and wh
 HOLD_OFF_PER_S = 10.0  # speed outwards per metre inside; acts on the stop point, which follows a command at once
 POINT_BAND_M = 0.05  # hold off from points up to this far inside the hull; deeper is no drift
 FENCE_BAND_M = 0.5  # the same for the fence
+PUSH_ROUNDS = 6  # each may find that something else is now unmet
+SECTORS = 16
 PROJECTIONS = 3  # two edges that meet, and back
 _LEAST_M = 1e-6
 _NO_NORMALS, _NO_SPEEDS = np.empty((2, 0)), np.empty(0)
@@ -38,13 +40,15 @@ class Allowance:
 
     `clearance_m` [k], `fence_m` [f]: least clearance of the tube beyond keep-out to each point, least room to each near piece of
     the fence, floor and ceiling (last two). `normals` [2, h], `outward_m_s` [h]: least part of a command along each horizontal
-    direction. `sink_m_s`, `climb_m_s`: least and greatest vertical command. `brake_stop_m` [2 models, 3].
+    direction. `push_m_s` [2]: a small horizontal command that does all that is due, zeros when nothing is. `sink_m_s`,
+    `climb_m_s`: least and greatest vertical command. `brake_stop_m` [2 models, 3].
     """
 
     clearance_m: Floats
     fence_m: Floats
     normals: Floats
     outward_m_s: Floats
+    push_m_s: Floats
     sink_m_s: float
     climb_m_s: float
     brake_stop_m: Floats
@@ -65,14 +69,9 @@ class Allowance:
         return permitted
 
     @property
-    def push_m_s(self) -> Floats:
-        """A horizontal velocity [2] that leads out of the points held off from; zeros when there are none."""
-        if self.outward_m_s.shape[0] == 0:
-            return np.zeros(2)
-        sum_m_s: Floats = self.normals @ self.outward_m_s
-        length = max(float(np.hypot(*sum_m_s)), _LEAST_M)
-        push: Floats = sum_m_s * (float(self.outward_m_s.max()) / length)
-        return push
+    def hover_m_s(self) -> Floats:
+        """No horizontal command [3]; vertically none either, but for what leads back from floor or ceiling."""
+        return np.array((0.0, 0.0, min(max(0.0, self.sink_m_s), self.climb_m_s)))
 
 
 def allowance(
@@ -96,12 +95,14 @@ def allowance(
         depth = -ways.room_m + slide
         normals = np.concatenate((normals, ways.normals[:, depth > 0.0]), axis=1)
         outward = np.concatenate((outward, _fence_hold_off_m_s(depth[depth > 0.0], config)))
+    push = _way_out_m_s(normals, outward, config)
     sink, climb = _vertical_bounds(fence_m[-2:], config)
     return Allowance(
         clearance_m=np.minimum(clear_m, max(min(0.0, worst), slide)),
         fence_m=np.minimum(0.0, fence_m),
         normals=normals,
-        outward_m_s=outward,
+        outward_m_s=np.where(outward > 0.0, np.minimum(outward, push @ normals), outward),
+        push_m_s=push,
         sink_m_s=sink,
         climb_m_s=climb,
         brake_stop_m=tube.stop_m[:, -1],
@@ -125,6 +126,33 @@ def _outward(tube: Tubes, clear_m: Floats, points_m: Floats, position_m: Floats,
     away = np.where(from_here, position_m[:, None], begin + share * leg) - points
     away /= np.maximum(np.sqrt((away * away).sum(axis=0)), _LEAST_M)
     return away, np.where(depth <= config.margin_m + POINT_BAND_M, _hold_off_m_s(depth, config), 0.0)
+
+
+def _way_out_m_s(normals: Floats, outward_m_s: Floats, config: SafetyConfig) -> Floats:
+    """The command [2] that leads out along all directions [2, h] as fast as is due; between contradictions it ends half way.
+
+    Least squares over what is unmet, one demand per sector, so that it does not count how many points lie on which side.
+    Longer than the return speed it is shortened: only so much may be asked of candidates.
+    """
+    way: Floats = np.zeros(2)
+    strongest = _strongest_per_sector(normals, outward_m_s)
+    held, due = normals[:, strongest], outward_m_s[strongest]
+    for _ in range(PUSH_ROUNDS):
+        unmet = due > way @ held
+        if not unmet.any():
+            break
+        active = held[:, unmet]
+        way = np.asarray(np.linalg.solve(active @ active.T + EPSILON_M * np.eye(2), active @ due[unmet]), dtype=np.float64)
+    return way * min(1.0, (config.return_speed_m_s - EPSILON_M) / max(float(np.hypot(way[0], way[1])), _LEAST_M))
+
+
+def _strongest_per_sector(normals: Floats, outward_m_s: Floats) -> NDArray[np.intp]:
+    """Of directions [2, h], the index of the one with the greatest demand in each sector that has any."""
+    sector = np.floor(np.arctan2(normals[1], normals[0]) * (SECTORS / (2.0 * np.pi))).astype(np.intp) % SECTORS
+    order = np.argsort(outward_m_s)
+    strongest = np.full(SECTORS, -1)
+    strongest[sector[order]] = order  # the last one written counts
+    return strongest[strongest >= 0]
 
 
 def _vertical_bounds(room_m: Floats, config: SafetyConfig) -> tuple[float, float]:

@@ -7,6 +7,7 @@ does not pass, a fixed number of scaled, turned and projected ones are tried; if
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ from safety.messages import Intervention
 from safety.sight import Hidden, Sight, View
 
 Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
 Integers = NDArray[np.intp]
 SCALES = (0.8, 0.6, 0.4, 0.2, 0.1, 0.05)
 TURNS_RAD = tuple(math.radians(angle) for angle in (15.0, 30.0, 45.0, 60.0, 75.0, 85.0))
@@ -70,8 +72,11 @@ class Shield:
         directions += [(math.cos(turn), sign * turn) for turn in TURNS_RAD for sign in (1, -1)]
         self._scaled = np.array([(scale * math.cos(turn), scale * math.sin(turn)) for scale, turn in directions])
 
-    def choose(self, wanted: CorridorVector, around: Surroundings) -> Decision:
-        """The wanted velocity itself when it is safe (same object), else the nearest safe candidate, else zero."""
+    def choose(self, wanted: CorridorVector, around: Surroundings, within_limits: Callable[[Floats], Booleans]) -> Decision:
+        """The wanted velocity itself when it is safe (same object), else the nearest safe candidate, else zero.
+
+        `within_limits`: which of some candidates [c, 3] may be sent at all after the command sent last.
+        """
         reach = self._reach_m(around.start)
         near = self._guard.look(around.position, around.start, reach)
         clearance, fence_margin = self._clearance_now(around), near.room_m
@@ -84,7 +89,10 @@ class Shield:
         passed, bounds = self._judge(first, around, near, found)
         if passed and not found:
             return Decision(wanted, (), clearance, fence_margin)
-        chosen = first[0] if passed else self._nearest(first[0], around, near, bounds, limit)
+        if passed:
+            return Decision(_vector(first[0]), tuple(found), clearance, fence_margin)
+        candidates = _capped(self._held_in(first[0], around, near, bounds.allowed), limit)
+        chosen = self._nearest(first[0], candidates[within_limits(candidates)], around, near, bounds)
         return Decision(_vector(chosen), tuple(found), clearance, fence_margin)
 
     def _speed_limit(self, around: Surroundings, clearance_m: float, fence_margin_m: float) -> float:
@@ -138,12 +146,15 @@ class Shield:
             return False, bounds
         return True, bounds
 
-    def _nearest(self, wanted: Floats, around: Surroundings, near: NearFence, bounds: Bounds, limit_m_s: float) -> Floats:
-        """Of all candidates that pass, the one nearest to the wanted vector [3]; zeros when none passes."""
-        allowed, brake = bounds.allowed, tubes(around.start, np.zeros((1, 3)), self._config)
+    def _held_in(self, wanted: Floats, around: Surroundings, near: NearFence, allowed: Allowance) -> Floats:
+        """All candidates [c, 3], turned along the fence, neither climbing nor sinking out of it."""
+        brake = tubes(around.start, np.zeros((1, 3)), self._config)
         candidates = held_in(self._candidates(wanted, around, allowed), self._guard.ways_out(brake, near), self._config)
-        candidates = _capped(candidates, limit_m_s)
         candidates[:, 2] = np.clip(candidates[:, 2], allowed.sink_m_s, allowed.climb_m_s)
+        return candidates
+
+    def _nearest(self, wanted: Floats, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Floats:
+        """Of the candidates [c, 3] that pass, the one nearest to the wanted vector [3]; when none passes, horizontally none."""
         away = candidates - wanted
         candidates = candidates[np.argsort(np.einsum("ci,ci->c", away, away), kind="stable")]
         for few in (candidates[:FIRST_LOOK], candidates[FIRST_LOOK:]):
@@ -151,7 +162,7 @@ class Shield:
             if passed.shape[0]:
                 nearest: Floats = few[passed[0]]
                 return nearest
-        return np.zeros(3)
+        return bounds.allowed.hover_m_s
 
     def _passing(self, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Integers:
         """Indices of the candidates [c, 3] that keep to the bounds; unseen space is counted only for those that pass all else."""
@@ -166,7 +177,8 @@ class Shield:
         """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""
         x, y, z = wanted
         a, b = self._scaled[:, 0], self._scaled[:, 1]
-        rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], np.array([[0.0, 0.0, z]])]
+        still = np.array([[0.0, 0.0, z], [0.0, 0.0, 0.0]])
+        rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], still]
         if around.x_m.shape[0]:
             rows += [self._slid(wanted, around, stop) for stop in allowed.brake_stop_m]
         plain = np.concatenate(rows)

@@ -15,20 +15,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_gateway.faults import Fault
 from sim_gateway.flight_report import FlightRecorder, write_json_atomically
+from sim_gateway.incidents import Incidents
 from sim_gateway.lidar import LidarConfig
+from sim_gateway.link_faults import LinkFaults
+from sim_gateway.mavlink_links import UdpLink
 from sim_gateway.mavlink_server import MavlinkServer
+from sim_gateway.pace import Pace
 from sim_gateway.piloted import PilotedVehicle
+from sim_gateway.report_faults import ReportFaults
 from sim_gateway.scene import Point, World
 from sim_gateway.scip import DEFAULT_PORT, ScipServer
 from sim_gateway.serial_lidar import SerialLidar
-from sim_gateway.simulation import Simulation, WindConfig, step_at
+from sim_gateway.simulation import Scan, Simulation, WindConfig, step_at
 from sim_gateway.telemetry import Telemetry
 from sim_gateway.vehicle import STEP_S
 
 # distance from the port a client listens on to the gateway's own port, as in PX4's SITL (14580 - 14540, 18570 - 14550)
 ONBOARD_PORT_OFFSET, GROUND_PORT_OFFSET = 40, 4020
-_GIVE_UP_BACKLOG_S = 0.5
+_TELL_EVERY_S = 0.2
 _MAX_STEPS_PER_TURN = 25
 _LONGEST_WAIT_S = 0.02
 
@@ -54,6 +60,16 @@ class GatewayConfig:
     report: Path | None = None
     serial_lidar: str | None = None
     serial_link: Path | None = None
+    faults: tuple[Fault, ...] = ()
+
+
+def connect_faults(vehicle: PilotedVehicle, server: MavlinkServer, telemetry: Telemetry, seed: int) -> Incidents:
+    """Let the faults of the vehicle's simulation reach its reports and its first link; call the result's `step`."""
+    schedule = vehicle.simulation.faults
+    telemetry.faults = ReportFaults(schedule, vehicle.simulation.motion_faults)
+    server.links[0].faults = LinkFaults(schedule, seed)
+    server.commands.schedule = schedule
+    return Incidents(vehicle, server, telemetry)
 
 
 def _simulation(world: World, config: GatewayConfig) -> Simulation:
@@ -87,10 +103,14 @@ class Gateway:
         onboard = (config.onboard_port + ONBOARD_PORT_OFFSET, config.onboard_port)
         ground = (config.gcs_port + GROUND_PORT_OFFSET, config.gcs_port) if config.gcs_port else None
         self.server = MavlinkServer(pilot, frame, self.telemetry, onboard, ground)
+        self.incidents = connect_faults(self.vehicle, self.server, self.telemetry, config.seed)
+        for fault in config.faults:
+            self.vehicle.simulation.inject(fault)
         self.carry: Callable[[float], tuple[Point, float]] | None = None
         self.alter_scan: Callable[[NDArray[np.float32]], NDArray[np.float32] | None] | None = None
-        self.lidar = ScipServer(lambda: self.vehicle.time_s, config.lidar_port)
-        self.dropped_s = 0.0
+        self.lidar = ScipServer(lambda: self.device_time_s, config.lidar_port)
+        self.pace = Pace(config.speed, time.monotonic())
+        self._told_s = 0.0
         self._started_s = math.nan
         self._scans = 0
         self._was_armed = False
@@ -132,26 +152,33 @@ class Gateway:
 
     def run(self, stop: threading.Event) -> None:
         """Pace vehicle time to the clock until `stop` is set or `max_time_s` of vehicle time is over, then write the report."""
-        self._started_s = origin_s = time.monotonic()
-        speed = self.config.speed
+        self._started_s = time.monotonic()
+        self.pace = Pace(self.config.speed, self._started_s)
         while not stop.is_set() and self.vehicle.time_s < self.config.max_time_s:
-            behind_s = (time.monotonic() - origin_s) * speed - self.vehicle.time_s
-            if behind_s > _GIVE_UP_BACKLOG_S * speed:
-                origin_s += behind_s / speed
-                self.dropped_s += behind_s / speed
-                _log.warning("%.2f s behind the clock: vehicle time stood still for that long", behind_s / speed)
-                behind_s = 0.0
+            behind_s = self.pace.behind_s(time.monotonic(), self.vehicle.time_s)
+            self._tell_dropped()
             for _ in range(min(int(behind_s / STEP_S), _MAX_STEPS_PER_TURN)):
                 self.step()
-            due_s = origin_s + (self.vehicle.simulation.steps + 1) * STEP_S / speed
+            due_s = self.pace.due_s((self.vehicle.simulation.steps + 1) * STEP_S)
             self._wait(due_s - time.monotonic())
         self.write_report()
+
+    @property
+    def device_time_s(self) -> float:
+        """What the LiDARs' own clocks show: they run on while vehicle time stands still."""
+        return self.vehicle.time_s + self.pace.dropped_s * self.config.speed
+
+    def _tell_dropped(self) -> None:
+        dropped_s = self.pace.dropped_s
+        if dropped_s - self._told_s >= _TELL_EVERY_S:
+            _log.warning("this computer is too slow: vehicle time stood still for %.2f s so far", dropped_s)
+            self._told_s = dropped_s
 
     def _wait(self, seconds: float) -> None:
         """Sleep until the next step is due; what arrives meanwhile is handled at once."""
         if seconds <= 0.0:
             return
-        sockets = [link.socket for link in self.server.links]
+        sockets = [link.socket for link in self.server.links if isinstance(link, UdpLink)]
         readable, _, _ = select.select(sockets, [], [], min(seconds, _LONGEST_WAIT_S))
         if readable:
             self.server.poll()
@@ -163,17 +190,22 @@ class Gateway:
             vehicle.simulation.carry(*self.carry(vehicle.time_s))
         vehicle.advance(1)
         self.recorder.watch()
+        ahead_s = self.device_time_s - vehicle.time_s
         if self.serial_lidar is not None:
-            self.serial_lidar.advance(vehicle.simulation)
+            self.serial_lidar.advance(vehicle.simulation, ahead_s)
         if vehicle.simulation.steps >= step_at(self._scans * 0.05):
             self._scans += 1
-            scan = vehicle.simulation.scan()
-            ranges = self.alter_scan(scan.ranges_m) if self.alter_scan is not None else scan.ranges_m
-            if ranges is not None:
-                self.lidar.publish(scan.time_s, ranges)
-                self.telemetry.scan = replace(scan, ranges_m=ranges)
+            for scan in vehicle.simulation.device_scans():
+                self._publish(scan, ahead_s)
+        self.incidents.step()
         self.server.poll()
         self._note_changes()
+
+    def _publish(self, scan: Scan, ahead_s: float) -> None:
+        ranges = self.alter_scan(scan.ranges_m) if self.alter_scan is not None else scan.ranges_m
+        if ranges is not None:
+            self.lidar.publish(scan.time_s + ahead_s, ranges)
+            self.telemetry.scan = replace(scan, ranges_m=ranges)
 
     def _note_changes(self) -> None:
         pilot = self.vehicle.autopilot
@@ -192,8 +224,13 @@ class Gateway:
             return
         elapsed_s = max(time.monotonic() - self._started_s, 1e-9)
         factor = round(self.vehicle.time_s / elapsed_s, 4)
-        content = self.recorder.as_dict(real_time_factor=factor, dropped_s=round(self.dropped_s, 3))
+        content = self.recorder.as_dict(real_time_factor=factor, dropped_s=round(self.pace.dropped_s, 3))
         content["received"] = self._received()
+        content["setpoints"] = self._setpoints()
+        content["faults"] = [
+            {"kind": item.kind, "begin_s": round(item.begin_s, 3), "end_s": item.end_s if math.isfinite(item.end_s) else None}
+            for item in self.vehicle.simulation.faults.placed
+        ]
         try:
             write_json_atomically(self.config.report, content)
         except OSError as error:
@@ -202,12 +239,18 @@ class Gateway:
     def _received(self) -> list[dict[str, Any]]:
         """What moved, armed or configured the vehicle came over the wire: kind, sender, how often, first and last time."""
         found: dict[tuple[str, tuple[int, int]], list[float]] = {}
-        for item in self.server.wire_log:
+        for item in self.server.wire_log.entries:
             found.setdefault((item.what, item.sender), []).append(round(item.time_s, 3))
         return [
             {"what": what, "from": f"{sender[0]}/{sender[1]}", "count": len(times), "first_s": times[0], "last_s": times[-1]}
             for (what, sender), times in found.items()
         ]
+
+    def _setpoints(self) -> dict[str, Any]:
+        """The newest velocity setpoints as they arrived: vehicle time, NED m/s, clockwise rad/s, sender."""
+        log = [item for item in self.server.wire_log.entries if item.velocity is not None]
+        rows = [[round(item.time_s, 3), *(round(v, 5) for v in item.velocity or ()), *item.sender] for item in log]
+        return {"columns": ["t", "north", "east", "down", "yaw_rate", "system", "component"], "rows": rows}
 
     def _facts(self) -> dict[str, Any]:
         world, config = self.world, self.config

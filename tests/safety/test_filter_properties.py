@@ -226,7 +226,9 @@ def test_turned_world_gives_the_turned_command(boxes, quarters, ux, uy, v):
     wide = FENCE.model_copy(update={"min_m": (-100.0, -100.0, 0.3), "max_m": (100.0, 100.0, 4.0)})
     here, _ = once(command(ux, uy), state(x=XC, y=YC, v=(v, 0, 0)), view(boxes, XC, YC, centre=(XC, YC)), fence=wide)
     wanted = command(c * ux - s * uy, s * ux + c * uy)
-    there, _ = once(wanted, state(x=XC, y=YC, v=(c * v, s * v, 0), yaw=yaw), view(turned, XC, YC, yaw=yaw, centre=(XC, YC)), fence=wide)
+    there, _ = once(
+        wanted, state(x=XC, y=YC, v=(c * v, s * v, 0), yaw=yaw), view(turned, XC, YC, yaw=yaw, centre=(XC, YC)), fence=wide
+    )
     assert away(wanted, there) == pytest.approx(away(command(ux, uy), here), abs=1e-3)
 
 
@@ -289,7 +291,9 @@ def test_commands_grow_and_turn_no_faster_than_the_acceleration_limit(commands):
     safety, last = SafetyFilter(config(max_acceleration_m_s2=2.0)), np.zeros(3)
     for k, wanted in enumerate(commands):
         time_s = 0.05 * k
-        sent, _ = safety.apply(command(*wanted), state(x=X0, time_s=time_s), scan(beams=360, fov=2 * math.pi, time_s=time_s), time_s)
+        sent, _ = safety.apply(
+            command(*wanted), state(x=X0, time_s=time_s), scan(beams=360, fov=2 * math.pi, time_s=time_s), time_s
+        )
         now = np.array(dataclasses.astuple(sent.velocity))
         keep = float(np.clip(now @ last / max(last @ last, 1e-12), 0.0, 1.0))
         limit = 2.0 * (0.1 if k == 0 else 0.05)

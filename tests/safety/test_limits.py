@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from safety_plant import command, config, scan, state
+from safety_plant import command, config
 
-from safety.filter import SafetyFilter
 from safety.frames import CorridorVector
 from safety.limits import AT_REST, LastSent, limit_command, sent_after
 
@@ -77,17 +76,3 @@ def test_growth_never_jumps_by_more_than_the_jerk(wanted, last, growth, jerk, ac
     assert np.linalg.norm(added) <= acceleration * DT_S + 1e-6
     assert np.linalg.norm(np.cross(added, wanted - keep * last)) < 1e-9  # shorter, never turned
     assert math.hypot(*sent[:2]) <= 1.2 + 1e-9
-
-
-def test_pause_counts_as_a_command_of_zero():
-    """The escalation sent zero in place of the filter's command: growth starts anew and nothing else is in flight."""
-    told, untold = SafetyFilter(config()), SafetyFilter(config())
-    for safety in (told, untold):
-        for k in range(10):
-            safety.apply(command(0.9), state(x=15.0, time_s=DT_S * k), scan(time_s=DT_S * k), DT_S * k)
-            if safety is told:
-                safety.pause(DT_S * k)
-    pose, seen = state(x=15.0, time_s=0.5), scan(time_s=0.5)
-    assert untold.apply(command(0.9), pose, seen, 0.5)[0].velocity.x == 0.9
-    assert told.apply(command(0.9), pose, seen, 0.5)[0].velocity.x == pytest.approx(0.375)
-    assert {u.x for _, u in told._history.phases(0.0, 0.5, v())} == {0.0}
