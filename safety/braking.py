@@ -21,8 +21,8 @@ from safety.messages import VehicleState
 
 Floats = NDArray[np.float64]
 HISTORY = 64
-ZERO = CorridorVector(0.0, 0.0, 0.0)
 STANDSTILL_M_S = 0.1  # moving obstacles: slower than this counts as standing
+ZERO = CorridorVector(0.0, 0.0, 0.0)
 _Triple = tuple[float, float, float]
 
 

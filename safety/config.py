@@ -35,10 +35,10 @@ class Fence(_Frozen):
 
     min_m: Corner | None = None
     max_m: Corner | None = None
-    floor_m: float | None = Field(None, description="lowest z (corridor z, 0 = ground at the corridor's origin)")
-    ceiling_m: float | None = Field(None, description="highest z")
-    inclusion: Ring | None = Field(None, description="the polygon inside which the vehicle stays")
-    exclusion: tuple[Ring, ...] = Field((), description="polygons outside which it stays")
+    floor_m: float | None = Field(default=None, description="lowest z (corridor z, 0 = ground at the corridor's origin)")
+    ceiling_m: float | None = Field(default=None, description="highest z")
+    inclusion: Ring | None = Field(default=None, description="the polygon inside which the vehicle stays")
+    exclusion: tuple[Ring, ...] = Field(default=(), description="polygons outside which it stays")
 
     @property
     def polygon(self) -> Ring:

@@ -52,8 +52,8 @@ class SafetyFilter:
         self._monitor.reset()
         self._history.clear()
         self._memory.clear()
-        self._last = AT_REST
         self._free.clear()
+        self._last = AT_REST
         self._last_time_s: float | None = None
         self._seen: SeenScan | None = None
         self.last_error = None

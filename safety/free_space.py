@@ -24,7 +24,7 @@ SIDE_CELLS = 128
 CARVE_M = 2.5  # a scan is taken in up to this far: a brake tube and the hull need less
 RECENTRE_CELLS = 8  # the map follows the vehicle in steps of this size
 SURFACE_CELLS = 2  # cells this near to a known return belong to it
-TAKE_OFF_M = 0.8  # at engaging nothing may stand nearer to the vehicle's centre than this, unseen by the LiDAR
+TAKE_OFF_M = 0.9  # at engaging nothing may stand nearer to the vehicle's centre than this, unseen by the LiDAR
 VICINITY_CELLS = 2  # around the swept hull: what is known there stays known while the vehicle stands
 STEP_M = 0.2  # between the discs that stand for a swept hull
 _REACH_ERROR_M = CELL_M * math.sqrt(2.0)  # of a cell's far corner, seen from anywhere in the cell of the LiDAR
@@ -60,7 +60,7 @@ class FreeSpace:
         """Take in a scan: what its beams went through, and where the vehicle is."""
         if self._began_s is None:
             self._began_s, self._shrunk_s = seen.time_s, seen.time_s
-            self._corner = tuple(_cell(p) - SIDE_CELLS // 2 for p in (seen.origin_x_m, seen.origin_y_m))
+            self._corner = (_cell(seen.origin_x_m) - SIDE_CELLS // 2, _cell(seen.origin_y_m) - SIDE_CELLS // 2)
             own = _disc(TAKE_OFF_M)
         else:
             self._follow(seen.origin_x_m, seen.origin_y_m)

@@ -30,8 +30,8 @@ class SeenScan:
     """A scan placed in the corridor frame.
 
     `x_m`, `y_m`, `spread_m` [k]: returns, and half the width between neighbouring beams there. `range_m` [n]: horizontal distance
-    per beam, inf = free, nan = unknown. `free_m` [n]: horizontal distance up to which a beam went through free space
-    at the vehicle's height, nan = unknown. `unseen` [n]: bearings around which too much is unknown. Pose of the LiDAR at `time_s`.
+    per beam, inf = free, nan = unknown. `free_m` [n]: horizontal distance up to which a beam went through free space at the
+    height of the vehicle, nan = unknown. `unseen` [n]: bearings around which too much is unknown. Pose of the LiDAR at `time_s`.
     """
 
     time_s: float
@@ -48,9 +48,14 @@ class SeenScan:
     unseen: Booleans | None
 
     @property
+    def beams(self) -> int:
+        """Number of beams."""
+        return int(self.range_m.shape[0])
+
+    @property
     def all_round(self) -> bool:
         """Whether the scan sees in all directions: then it has no edges."""
-        return self.range_m.shape[0] * self.angle_increment_rad > 2.0 * math.pi - self.angle_increment_rad
+        return self.beams * self.angle_increment_rad > 2.0 * math.pi - self.angle_increment_rad
 
 
 def scan_problem(scan: LidarScan) -> str | None:

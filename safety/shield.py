@@ -23,6 +23,7 @@ from safety.sight import Hidden, Sight, View
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
+Integers = NDArray[np.intp]
 SCALES = (0.8, 0.6, 0.4, 0.2, 0.1, 0.05)
 TURNS_RAD = tuple(math.radians(angle) for angle in (15.0, 30.0, 45.0, 60.0, 75.0, 85.0))
 PUSHES = (1.0, 1.5)  # candidates are shifted by these multiples of what leads out of a margin
@@ -40,6 +41,14 @@ class Surroundings:
     view: View
     position: CorridorVector
     start: Start
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What braking sets for all commands of a tick: clearances and speeds, and the unseen space on its way."""
+
+    allowed: Allowance
+    hidden: Hidden
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,16 +82,17 @@ class Shield:
         clearance, fence_margin = self._clearance_now(around), near.room_m
         around = self._within_reach(around, reach)
         limit = self._speed_limit(around, clearance, fence_margin)
-        first = _capped(np.array(((wanted.x, wanted.y, wanted.z), (0.0, 0.0, 0.0))), limit)
+        first = np.array(((wanted.x, wanted.y, wanted.z), (0.0, 0.0, 0.0)))
         speed = math.hypot(wanted.x, wanted.y)
         found = [Intervention("return_speed", speed, limit)] if speed > limit else []
-        passed, brake, hidden = self._judge(first, around, near, found)
+        first = _capped(first, limit)
+        passed, bounds = self._judge(first, around, near, found)
         if passed and not found:
             return Decision(wanted, (), clearance, fence_margin)
         if passed:
             return Decision(_vector(first[0]), tuple(found), clearance, fence_margin)
-        candidates = self._held_in(first[0], around, near, brake, limit)
-        chosen = self._nearest(candidates[within_limits(candidates)], around, near, brake, hidden)
+        candidates = _capped(self._held_in(first[0], around, near, bounds.allowed), limit)
+        chosen = self._nearest(first[0], candidates[within_limits(candidates)], around, near, bounds)
         return Decision(_vector(chosen), tuple(found), clearance, fence_margin)
 
     def _speed_limit(self, around: Surroundings, clearance_m: float, fence_margin_m: float) -> float:
@@ -106,10 +116,8 @@ class Shield:
             + config.max_horizontal_speed_m_s * config.tick_s / config.lag_min_s
         )
         apart = math.dist(start.position_m[0, :2], start.position_m[1, :2])
-        errors = config.velocity_error_m_s * config.delay_s
-        errors += config.obstacle_speed_m_s * (
-            config.dead_time_s + config.tick_s + float(slow_after_s(fast * config.lag_s, config))
-        )
+        blind_s = config.dead_time_s + config.tick_s + float(slow_after_s(fast * config.lag_s, config))
+        errors = config.velocity_error_m_s * config.delay_s + config.obstacle_speed_m_s * blind_s
         stop = config.stop_distance_m(fast + config.max_horizontal_speed_m_s * config.tick_s)
         return config.keep_out_m + apart + errors + stop
 
@@ -121,47 +129,55 @@ class Shield:
         x, y = around.x_m[near], around.y_m[near]
         return Surroundings(x, y, around.extra_m[near], around.view.beside(np.array((x, y))), around.position, around.start)
 
-    def _judge(
-        self, first: Floats, around: Surroundings, near: NearFence, found: list[Intervention]
-    ) -> tuple[bool, Allowance, Hidden]:
-        """Judge the wanted command (row 0) against what braking (row 1) sets: an allowance, and the unseen space on its way."""
+    def _judge(self, first: Floats, around: Surroundings, near: NearFence, found: list[Intervention]) -> tuple[bool, Bounds]:
+        """Judge the wanted command (row 0) against what braking (row 1) sets."""
         tube = tubes(around.start, first, self._config)
         clear, fence = self._tube_clearances(tube, around), self._guard.rooms_m(tube, around.start, near)
         position = np.array((around.position.x, around.position.y))
-        ways = self._guard.ways_out(tube, near) if (fence[1, :-2] < 0.0).any() else None
+        pressed = (fence[1, :-2] < 0.0).any() or (clear[1] < 0.0).any()
+        ways = self._guard.ways_out(tube, near) if pressed else None
         allowed = allowance(tube, clear[1], fence[1], around.view.near_m, position, ways, self._config)
-        brake = self._sight.hidden(tube.rows(slice(1, 2)), around.view)
+        hidden = self._sight.hidden(tube, around.view)
+        bounds = Bounds(allowed, hidden.rows(slice(1, 2)))
         if not allowed.permits(first[:1], clear[:1], fence[:1])[0]:
             found.extend(_reasons(allowed, first[0], clear[0], fence[0]))
-            return False, allowed, brake
-        wanted = self._sight.hidden(tube.rows(slice(0, 1)), around.view)
-        if not brake.permits(wanted)[0]:
-            found.append(Intervention("unseen", float(wanted.wide[0]), float(brake.wide[0])))
-            return False, allowed, brake
-        return True, allowed, brake
+            return False, bounds
+        seen = self._sight.permitted(bounds.hidden, tube, hidden, allowed.brake_stop_m, around.view)
+        if not seen[0]:
+            found.append(Intervention("unseen", float(hidden.wide[0]), float(hidden.wide[1])))
+            return False, bounds
+        return True, bounds
 
-    def _held_in(self, wanted: Floats, around: Surroundings, near: NearFence, allowed: Allowance, limit_m_s: float) -> Floats:
-        """All candidates [c, 3], turned along the fence, not too fast for where they begin; nearest to the wanted one first."""
+    def _held_in(self, wanted: Floats, around: Surroundings, near: NearFence, allowed: Allowance) -> Floats:
+        """All candidates [c, 3], turned along the fence, neither climbing nor sinking out of it."""
         brake = tubes(around.start, np.zeros((1, 3)), self._config)
-        candidates = held_in(self._candidates(wanted, around, allowed), self._guard.ways_out(brake, near), self._config)
-        candidates = _capped(candidates, limit_m_s)
+        candidates = held_in(
+            self._candidates(wanted, around, allowed), self._guard.ways_out(brake, near), allowed.push_m_s, self._config
+        )
         candidates[:, 2] = np.clip(candidates[:, 2], allowed.sink_m_s, allowed.climb_m_s)
-        away = candidates - wanted
-        nearest_first: Floats = candidates[np.argsort(np.einsum("ci,ci->c", away, away), kind="stable")]
-        return nearest_first
+        return candidates
 
-    def _nearest(self, candidates: Floats, around: Surroundings, near: NearFence, allowed: Allowance, brake: Hidden) -> Floats:
-        """The first of the candidates [c, 3] that passes; when none does, horizontally nothing."""
+    def _nearest(self, wanted: Floats, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Floats:
+        """Of the candidates [c, 3] that pass, the one nearest to the wanted vector [3]; when none passes, horizontally none."""
+        away = candidates - wanted
+        candidates = candidates[np.argsort(np.einsum("ci,ci->c", away, away), kind="stable")]
         for few in (candidates[:FIRST_LOOK], candidates[FIRST_LOOK:]):
-            tube = tubes(around.start, few, self._config)
-            rooms = self._guard.rooms_m(tube, around.start, near)
-            passed = np.flatnonzero(allowed.permits(few, self._tube_clearances(tube, around), rooms))
-            if passed.shape[0]:
-                passed = passed[brake.permits(self._sight.hidden(tube.rows(passed), around.view))]
+            passed = self._passing(few, around, near, bounds)
             if passed.shape[0]:
                 nearest: Floats = few[passed[0]]
                 return nearest
-        return allowed.hover_m_s
+        return bounds.allowed.hover_m_s
+
+    def _passing(self, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Integers:
+        """Indices of the candidates [c, 3] that keep to the bounds; unseen space is counted only for those that pass all else."""
+        tube = tubes(around.start, candidates, self._config)
+        rooms = self._guard.rooms_m(tube, around.start, near)
+        passed = np.flatnonzero(bounds.allowed.permits(candidates, self._tube_clearances(tube, around), rooms))
+        if passed.shape[0] == 0:
+            return passed
+        tube = tube.rows(passed)
+        hidden = self._sight.hidden(tube, around.view)
+        return passed[self._sight.permitted(bounds.hidden, tube, hidden, bounds.allowed.brake_stop_m, around.view)]
 
     def _candidates(self, wanted: Floats, around: Surroundings, allowed: Allowance) -> Floats:
         """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""

@@ -1,8 +1,7 @@
 """How much unseen space a brake tube leads through, compared with what braking itself would need.
 
 A command may lead through no unseen cell, or, when braking itself does (start in the unseen, drift, memory run out), through no
-more than braking. Counted with one cell to spare, so that the grid's own steps do not count as a breach: only the exact count
-slows down.
+more than braking. Counted with one cell to spare, so that the grid's own steps are no breach: only the exact count slows down.
 """
 
 from __future__ import annotations
@@ -21,6 +20,8 @@ from safety.free_space import STEP_M, FreeSpace
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 Booleans = NDArray[np.bool_]
+OUT_M = 0.3  # how far ahead fewer unseen cells must lie: several cells, since a tick moves the stop point by a fraction of one
+LEAST_WAY_M = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +44,10 @@ class Hidden:
     wide: Integers
     exact: Integers
 
+    def rows(self, chosen: slice) -> Hidden:
+        """The counts of some tubes."""
+        return Hidden(self.wide[chosen], self.exact[chosen])
+
     def permits(self, others: Hidden) -> Booleans:
         """Which tubes lead through no more than this one."""
         permitted: Booleans = (others.wide <= self.wide) & (others.exact <= self.exact)
@@ -60,6 +65,27 @@ class Sight:
         """Whether the vehicle is in unseen space."""
         x, y = np.array((position.x,)), np.array((position.y,))
         return bool(view.free.unseen(x, y, view.near_m, view.now_s, wide=False)[0])
+
+    def permitted(self, brake: Hidden, tube: Tubes, hidden: Hidden, brake_stop_m: Floats, view: View) -> Booleans:
+        """Which tubes, with their counts, may be flown: where braking leads through unseen cells, only those that lead out.
+
+        Without that, commands each too small to reach another cell would carry the stop point on for ever. `brake_stop_m`
+        [2 models, 3].
+        """
+        passed = brake.permits(hidden)
+        if brake.exact[0] == 0 or not passed.any():
+            return passed
+        return passed & ((hidden.exact == 0) | self._leads_out(tube, brake_stop_m[0, :2], view))
+
+    @staticmethod
+    def _leads_out(tube: Tubes, stop_m: Floats, view: View) -> Booleans:
+        """Which tubes move the stop point towards where fewer cells are unseen, or not at all."""
+        way = tube.stop_m[0, :, :2] - stop_m
+        length = np.hypot(way[:, 0], way[:, 1])
+        ahead = np.concatenate((stop_m[None], stop_m + OUT_M * way / np.maximum(length, LEAST_WAY_M)[:, None]))
+        count = view.free.unseen(ahead[:, 0], ahead[:, 1], view.near_m, view.now_s, wide=False)
+        out: Booleans = (count[1:] < count[0]) | (length <= LEAST_WAY_M)
+        return out
 
     def hidden(self, tube: Tubes, view: View) -> Hidden:
         """The unseen cells on each tube, of both models."""

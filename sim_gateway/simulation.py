@@ -164,7 +164,7 @@ def _read_motion(state: Array, error: Array, acceleration_error: Array, out: Arr
 class SensorNoise:
     """Random numbers of one sensor: counter-based, so that those of a time do not depend on what was read before."""
 
-    def __init__(self, key: NDArray[np.uint64]) -> None:
+    def __init__(self, key: NDArray[np.unsignedinteger]) -> None:
         self._bits = np.random.Philox(key=key)
         self._generator = np.random.Generator(self._bits)
         self._fresh = self._bits.state
