@@ -89,7 +89,7 @@ class Shield:
         passed, bounds = self._judge(first, around, near, found)
         if passed and not found:
             return Decision(wanted, (), clearance, fence_margin)
-        if passed:
+        if passed and within_limits(first[:1])[0]:
             return Decision(_vector(first[0]), tuple(found), clearance, fence_margin)
         candidates = _capped(self._held_in(first[0], around, near, bounds.allowed), limit)
         chosen = self._nearest(first[0], candidates[within_limits(candidates)], around, near, bounds)
