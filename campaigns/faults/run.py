@@ -13,7 +13,7 @@ from flight.mission import Mission
 from policy_export.runner import PolicyRunner
 from safety.filter import SafetyFilter
 
-OBSERVED_S = 4.5
+OBSERVED_S = 3.8
 
 
 @dataclass(frozen=True, slots=True)
