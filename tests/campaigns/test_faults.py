@@ -59,7 +59,8 @@ def test_cases_are_every_fault_in_every_scene_with_every_seed() -> None:
     ("fault", "scene"),
     [
         ("L1", "wall"), ("L5", "engage"), ("L8", "hover"), ("L13", "wall"), ("L18", "yawing"), ("E1", "corner"),
-        ("E3", "braking"), ("E9", "hover"), ("K1", "wall"), ("K2", "corner"), ("K5", "yawing"), ("K8", "hover"), ("P1", "wall"), ("P3", "yawing"),
+        ("E3", "braking"), ("E9", "hover"), ("K1", "wall"), ("K2", "corner"), ("K5", "yawing"), ("K8", "hover"),
+        ("P1", "wall"), ("P3", "yawing"),
         ("P7", "wall"), ("C1", "wall"), ("C5", "hover"), ("C7", "yawing"), ("C11", "hover"), ("V1", "braking"), ("V3", "hover"),
         ("V5", "engage"), ("V6", "wall"),
     ],

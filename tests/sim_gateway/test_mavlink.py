@@ -19,7 +19,8 @@ from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.autopilot import StatusText
 from sim_gateway.flight_modes import FlightMode, Result
-from sim_gateway.mavlink_server import MavlinkServer, PortInUseError
+from sim_gateway.mavlink_links import PortInUseError
+from sim_gateway.mavlink_server import MavlinkServer
 from sim_gateway.piloted import PilotedVehicle
 from sim_gateway.scene import World
 from sim_gateway.simulation import Simulation
