@@ -200,18 +200,18 @@ class OffboardFlight:
 
     def _lost_control(self, now_s: float) -> Ending | None:
         """Pilot first: a mode that fly did not command ends its control for good, whoever chose it."""
+        if (ending := self._lost_stream(now_s)) is not None:
+            return ending
         authority, telemetry = self._link.authority, self._link.telemetry
         if authority is not None and (reason := authority.lost) is not None:
             return Ending(authority.outcome, ExitCode.NOT_REACHED, reason, in_control=False)
-        if (ending := self._lost_stream(now_s)) is not None:
-            return ending
         if now_s - telemetry.heartbeat_s > LINK_LOST_S:
             message = f"no heartbeat from the vehicle for {LINK_LOST_S:g} s: the stream stops, PX4's own failsafe flies"
             return Ending("link_lost", ExitCode.SAFETY_ENDED, message, in_control=False)  # blind: a pilot may have it
         return None
 
     def _lost_stream(self, now_s: float) -> Ending | None:
-        """What the guard did while this loop was not looking, or that it is gone itself."""
+        """What the guard did while this loop was not looking, or that it is gone: the cause, where a mode is the effect."""
         guard = self._link.guard
         if guard.lost is not None:
             return Ending("guard_lost", ExitCode.SAFETY_ENDED, guard.lost, in_control=False)

@@ -60,6 +60,7 @@ Array = NDArray[np.float64]
 MAX_STEPS_PER_CALL = 250 * 3600
 _NORMALS = PROCESSES + 3  # one step's draws: estimate errors, then gusts
 _SCAN_STREAM, _ACCELERATION_STREAM = 0, 1
+_NO_ERROR, _NO_NOISE = np.zeros(ERROR_SIZE), np.zeros(3)
 
 # running log of the kernel
 _LEAST_CLEARANCE, _TOUCHING, _CONTACTS, _FLOWN = 0, 1, 2, 3
@@ -144,6 +145,37 @@ def _advance(  # type: ignore[no-untyped-def]
         _watch_clearance(boxes, state, radius, log)
 
 
+@njit(cache=True)
+def _read_motion(state: Array, error: Array, acceleration_error: Array, out: Array) -> None:
+    """Position, velocity, acceleration, roll, pitch, yaw (not wrapped) and body rates with their errors into `out` [15]."""
+    for i in range(3):
+        out[i] = state[POS + i] + error[POSITION_ERROR + i] + error[POSITION_BIAS + i]
+        out[3 + i] = state[VEL + i] + error[VELOCITY_ERROR + i]
+        out[6 + i] = state[ACC + i] + acceleration_error[i]
+        out[12 + i] = state[OMEGA + i]
+    roll, pitch = roll_pitch_rad(state)
+    out[9], out[10], out[11] = (
+        roll + error[ATTITUDE_ERROR],
+        pitch + error[ATTITUDE_ERROR + 1],
+        yaw_rad(state) + error[ATTITUDE_ERROR + 2],
+    )
+
+
+class SensorNoise:
+    """Random numbers of one sensor: counter-based, so that those of a time do not depend on what was read before."""
+
+    def __init__(self, key: NDArray[np.unsignedinteger]) -> None:
+        self._bits = np.random.Philox(key=key)
+        self._generator = np.random.Generator(self._bits)
+        self._fresh = self._bits.state
+
+    def at(self, step: int) -> np.random.Generator:
+        """The generator at the start of its numbers for a step. The same object each time: draw before asking again."""
+        self._fresh["state"]["counter"][2] = step
+        self._bits.state = self._fresh
+        return self._generator
+
+
 def step_at(time_s: float) -> int:
     """Number of the physics step nearest to `time_s` (halves round up): tick k of 20 Hz is at `step_at(k * 0.05)`.
 
@@ -185,9 +217,10 @@ class Simulation:
         flying = hover_height_m is not None
         place = (*world.start[:2], world.start[2] if hover_height_m is None else hover_height_m)
         self._state = initial_state(place, world.start_yaw_rad, flying, params)
+        self._reading = np.empty(15)
         self._boxes = world.boxes_at(0.0)
         self._generator = np.random.Generator(np.random.PCG64([seed, 0]))
-        self._sensor_keys = [np.random.SeedSequence([seed, 1, i]).generate_state(2, np.uint64) for i in range(2)]
+        self._sensors = [SensorNoise(np.random.SeedSequence([seed, 1, i]).generate_state(2, np.uint64)) for i in range(2)]
         self._start_errors(estimate_preset(estimate) if isinstance(estimate, str) else estimate)
         self._start_wind(wind)
         self.faults = FaultSchedule()
@@ -237,6 +270,15 @@ class Simulation:
         state[QUAT : QUAT + 4] = (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
         state[OMEGA : OMEGA + 3] = 0.0
 
+    def disturb(self, position_m: Sequence[float], velocity_m_s: Sequence[float], wind_m_s: Sequence[float]) -> None:
+        """Put the estimate's errors and the steady wind where an adversary wants them (corridor frame), from the next step on.
+
+        They stay only where nothing random moves them: `EstimateNoise.held()` and no gusts.
+        """
+        self._error[POSITION_ERROR : POSITION_ERROR + 3] = position_m
+        self._error[VELOCITY_ERROR : VELOCITY_ERROR + 3] = velocity_m_s
+        self._wind_mean[:] = wind_m_s
+
     def advance_motors_off(self, n_steps: int) -> None:
         """Let `n_steps` of 4 ms pass with the motors off: at rest on the ground, falling in the air."""
         self._step(n_steps, np.zeros(3), 0.0, motors_on=False)
@@ -270,33 +312,26 @@ class Simulation:
     @property
     def truth(self) -> Motion:
         """What really is."""
-        return self._motion(np.zeros(ERROR_SIZE), np.zeros(3))
+        return self._motion(_NO_ERROR, _NO_NOISE)
 
-    def estimate(self) -> Motion:
-        """What the vehicle believes: truth plus the estimate's errors. Reading twice at one time gives the same."""
-        motion = self._motion(self._error, self._acceleration_error())
+    def estimate(self, *, acceleration_noise: bool = True) -> Motion:
+        """What the vehicle believes: truth plus the estimate's errors. Reading twice at one time gives the same.
+
+        Without `acceleration_noise` the acceleration is the true one: quicker, for readers that have no use for it.
+        """
+        motion = self._motion(self._error, self._acceleration_error() if acceleration_noise else _NO_NOISE)
         return self.motion_faults.estimate(motion) if self.motion_faults.any else motion
 
     def _acceleration_error(self) -> Array:
         if not self._acceleration_sigma.any():
-            return np.zeros(3)
-        return self._acceleration_sigma * self._sensor_generator(_ACCELERATION_STREAM).standard_normal(3)
+            return _NO_NOISE
+        return self._acceleration_sigma * self._sensors[_ACCELERATION_STREAM].at(self.steps).standard_normal(3)
 
     def _motion(self, error: Array, acceleration_error: Array) -> Motion:
-        state = self._state
-        position = state[POS : POS + 3] + error[POSITION_ERROR : POSITION_ERROR + 3] + error[POSITION_BIAS : POSITION_BIAS + 3]
-        roll, pitch = roll_pitch_rad(state)
-        heading = math.remainder(yaw_rad(state) + error[ATTITUDE_ERROR + 2], 2.0 * math.pi)
-        return Motion(
-            time_s=self.time_s,
-            position_m=_triple(position),
-            velocity_m_s=_triple(state[VEL : VEL + 3] + error[VELOCITY_ERROR : VELOCITY_ERROR + 3]),
-            acceleration_m_s2=_triple(state[ACC : ACC + 3] + acceleration_error),
-            roll_rad=roll + float(error[ATTITUDE_ERROR]),
-            pitch_rad=pitch + float(error[ATTITUDE_ERROR + 1]),
-            yaw_rad=heading,
-            angular_rate_rad_s=_triple(state[OMEGA : OMEGA + 3]),
-        )
+        _read_motion(self._state, error, acceleration_error, self._reading)
+        x, y, z, vx, vy, vz, ax, ay, az, roll, pitch, heading, p, q, r = self._reading.tolist()
+        yaw = math.remainder(heading, 2.0 * math.pi)
+        return Motion(self.time_s, (x, y, z), (vx, vy, vz), (ax, ay, az), roll, pitch, yaw, (p, q, r))
 
     @property
     def truth_position_m(self) -> Point:
@@ -327,7 +362,7 @@ class Simulation:
 
     def scan(self) -> Scan:
         """What the scanner sees now, from the vehicle's true place and tilt. Reading twice at one time gives the same."""
-        generator = self._sensor_generator(_SCAN_STREAM)
+        generator = self._sensors[_SCAN_STREAM].at(self.steps)
         ranges = self._lidar.scan(self._boxes, self._state[POS : POS + 3], rotation(self._state), generator)
         config = self._lidar.config
         angles = (config.angle_min_rad, config.angle_increment_rad)
@@ -360,10 +395,6 @@ class Simulation:
     def flown_m(self) -> float:
         """Length of the true path so far, at 250 Hz."""
         return float(self._log[_FLOWN])
-
-    def _sensor_generator(self, stream: int) -> np.random.Generator:
-        """Noise of one sensor at the current time: counter-based, so that it does not depend on what was read before."""
-        return np.random.Generator(np.random.Philox(key=self._sensor_keys[stream], counter=[0, 0, self.steps, 0]))
 
 
 def _triple(values: Array) -> Point:

@@ -111,8 +111,10 @@ class SetpointGuard:
         self._sequence = self._answered = 0
         self._send(pack_engage(Engage(self._engagement, target)))
         self._wait_for(lambda: self.answer is not None and self.answer.engagement == self._engagement, ENGAGE_DEADLINE_S)
+        if self._lost is not None:
+            raise GuardLostError(self._lost)
         if self.answer is None or self.answer.engagement != self._engagement:
-            raise GuardLostError(self._lost or "the guard takes no engagement: it was told to end")
+            raise VehicleCommandError("the guard takes no engagement: it was told to end, or does not answer")
 
     def command(self, setpoint: Velocity, stamp_s: float) -> float | None:
         """Hand over a command decided at `stamp_s`; returns when it went out, None when the guard did not let it.

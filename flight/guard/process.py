@@ -126,17 +126,21 @@ class GuardProcess:
         if self.core.admit(command, self._clock()):
             gone = self._port.send(frame, urgent=True)
             now_s = self._clock()
+            self._frames += 1
             sent_s = now_s if gone else math.nan
             if self.core.overran(command, now_s):
-                self._port.send(self._frame(STILL), urgent=True)
+                self._send_still()
         self._answer(command.sequence, sent_s)
 
     def _brake(self) -> None:
         if self.core.brake_due(self._clock()):
-            self._port.send(self._frame(STILL), urgent=True)
+            self._send_still()
+
+    def _send_still(self) -> None:
+        self._port.send(self._frame(STILL), urgent=True)
+        self._frames += 1
 
     def _frame(self, setpoint: Velocity) -> bytes:
-        self._frames += 1
         boot_ms = int(self._clock() * 1e3)
         try:
             return pack_setpoint(self._frames, boot_ms, OWN_IDS, self._target, setpoint[:3], setpoint[3])
@@ -212,7 +216,8 @@ def serve(url: str, control: socket.socket, priority: int) -> None:
     signal.signal(signal.SIGTERM, guard.on_signal)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is for `fly`, which lands
     _be_quick(priority)
-    control.send(bytes((Kind.READY,)) + relay.getsockname()[1].to_bytes(2, "little"))
+    with contextlib.suppress(OSError):  # a loop that is gone by now shows as the end of the socket
+        control.send(bytes((Kind.READY,)) + relay.getsockname()[1].to_bytes(2, "little"))
     with contextlib.suppress(PortError):  # the end of the wire is the end of this process: the loop sees that
         guard.run(wake)
 
