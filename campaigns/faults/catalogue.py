@@ -126,7 +126,7 @@ _FROM_THE_START = "before OFFBOARD nothing tells a blind scanner from open space
 _LIDAR = (
     Entry("L1", "no scan", _brake(0.3, "scan_stale", "scan_missing"), _lasting("lidar_silent")),
     Entry("L2", "frozen scan, fresh stamps", _brake(0.4, "scan_frozen"), _lasting("lidar_freeze"),
-          scenes=_in(SAFE, "hover", "engage"), note=_SLOW),
+          scenes=_in(SAFE, "hover", "engage", "braking"), note=_SLOW),
     Entry("L3", "frozen scan, old stamps", _brake(0.3, "scan_stale"), _lasting("lidar_freeze_old")),
     Entry("L4", "nothing seen in any beam", _brake(0.25, "scan_blank"), _lasting("lidar_max"),
           scenes=_in(SAFE, "engage"), note=_FROM_THE_START),

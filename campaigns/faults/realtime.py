@@ -12,6 +12,7 @@ import math
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -149,8 +150,8 @@ def trace_of(report: dict[str, Any], felt_after_s: float = 0.0) -> Trace:
     return trace
 
 
-def fly_all(mission_file: Path, only: list[str] | None, command: str) -> dict[str, Any]:
-    """One flight after the other, each told as soon as it is over."""
+def fly_all(mission_file: Path, only: list[str] | None, command: str, keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    """One flight after the other; each is told as soon as it is over, and `keep` gets all results so far."""
     policy = load_mission(mission_file).policy.path
     chosen = [ENTRIES[name] for name in FLOWN if only is None or name in only]
     results = []
@@ -160,5 +161,9 @@ def fly_all(mission_file: Path, only: list[str] | None, command: str) -> dict[st
         took = "" if result.reaction_s is None else f", {1e3 * result.reaction_s:.0f} ms"
         sys.stderr.write(f"{entry.id} {entry.title}: {result.problem or 'right'}{took}; {result.outcome}\n")
         sys.stderr.flush()
-    summary = summarise(results, command, 1)
-    return summary | {"kind": "fault campaign in real time", "slack_s": SLACK_S}
+        keep(_summary(results, command))
+    return _summary(results, command)
+
+
+def _summary(results: list[Result], command: str) -> dict[str, Any]:
+    return summarise(results, command, 1) | {"kind": "fault campaign in real time", "slack_s": SLACK_S}
