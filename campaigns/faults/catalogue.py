@@ -181,7 +181,8 @@ _LINK = (
           _lasting("link_burst", burst_s=0.4, period_s=1.5), scenes=_in(SAFE, "engage"), note="until a healthy second is over"),
     Entry("K4", "0.3 s more delay, both ways", _hold(1.0, "link_slow", "state_stale"), _lasting("link_delay", 9.0)),
     Entry("K5", "duplicates and reordering", FLY, (*_lasting("link_duplicate"), *_lasting("link_reorder"))),
-    Entry("K6", "another program sends setpoints", _hold(1.0, "foreign_setpoint"), _lasting("rogue", 9.0, y_m_s=0.5, rate_hz=31.0)),
+    Entry("K6", "another program sends setpoints", _hold(1.0, "foreign_setpoint"),
+          _lasting("rogue", 9.0, y_m_s=0.5, rate_hz=31.0)),
     Entry("K7", "a second vehicle with the same ids", _yield(TICK_S), _lasting("link_foreign")),
     Entry("K8", "malformed messages", FLY, _lasting("link_garbage")),
     Entry("K9", "flood of 10,000 messages/s", FLY, _lasting("link_flood")),
@@ -232,7 +233,8 @@ _VEHICLE = (
     Entry("V6", "battery down to 12 %", _hold(1.0, "battery_low"), _once("battery", fraction=0.12)),
     Entry("V7", "velocity loop at 60 % of its gain", SAFE, _lasting("sluggish", 9.0, share=0.6)),
     Entry("V8", "gust of 3 m/s for 3 s", SAFE, _lasting("gust", x_m_s=3.0), note="inside the wind assumed in A1"),
-    Entry("V9", "landed while the policy flies", _yield(0.3), _lasting("report_landed")),
+    Entry("V9", "landed while the policy flies", _yield(0.3), _lasting("report_landed"), scenes=_in(_yield(1.6), "engage"),
+          note="in the handshake, when OFFBOARD begins"),
     Entry("V10", "speed not reached: six times the drag", FLY, _lasting("heavy")),
 )  # fmt: skip
 
