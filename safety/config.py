@@ -119,11 +119,10 @@ class SafetyConfig(_Frozen):
     state_stale_s: Positive = Field(0.2, description="a state estimate older than this is no estimate")
     future_tolerance_s: NotNegative = Field(0.02, description="a stamp this far ahead of the clock is still accepted")
 
-    blind_speed_m_s: NotNegative = Field(0.3, description="speed allowed into directions the LiDAR does not see")
     return_speed_m_s: Positive = Field(0.3, description="speed allowed while nearer than the margin or outside the fence")
     hold_off_speed_m_s: NotNegative = Field(0.25, description="speed out of a margin when drift, not a command, leads into it")
     fov_margin_rad: NotNegative = Field(0.1, description="this much of each edge of the field of view counts as unseen")
-    memory_s: NotNegative = Field(20.0, description="returns that left the field of view are remembered this long")
+    memory_s: NotNegative = Field(20.0, description="returns and free space that left the field of view are remembered this long")
     memory_hold_s: NotNegative = Field(0.12, description="a return is kept this long although newer scans look past it")
     ground_z_m: float = Field(0.0, description="corridor z of the ground; returns this low are the ground, not obstacles")
     monitors: MonitorConfig = Field(MonitorConfig.model_validate({}), description="thresholds of the monitors")
@@ -167,7 +166,6 @@ class SafetyConfig(_Frozen):
     def _consistent(self) -> Self:
         for low, high in (
             ("lag_min_s", "lag_s"),
-            ("blind_speed_m_s", "max_horizontal_speed_m_s"),
             ("return_speed_m_s", "max_horizontal_speed_m_s"),
             ("hold_off_speed_m_s", "return_speed_m_s"),
             ("hold_off_speed_m_s", "max_vertical_speed_m_s"),

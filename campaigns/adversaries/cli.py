@@ -44,10 +44,13 @@ def campaign(chosen: argparse.Namespace) -> int:
     out.parent.mkdir(parents=True, exist_ok=True)
     began = saved = time.monotonic()
     blocks: dict[str, Block] = {}
-    for _ in gather(blocks, run_all(plan(chosen.ticks, chosen.seed), chosen.jobs)):
-        if time.monotonic() - saved > SAVE_EVERY_S:
-            saved = time.monotonic()
-            _save(out, chosen, blocks, {"partial": True})
+    try:
+        for _ in gather(blocks, run_all(plan(chosen.ticks, chosen.seed), chosen.jobs)):
+            if time.monotonic() - saved > SAVE_EVERY_S:
+                saved = time.monotonic()
+                _save(out, chosen, blocks, {"partial": True})
+    except KeyboardInterrupt:
+        print("stopped: what was flown so far is reported", file=sys.stderr)
     liveness = run_liveness(chosen.seed, chosen.jobs)
     report = _save(out, chosen, blocks, {"wall_s": round(time.monotonic() - began), "liveness": liveness})
     heat_map(report["blocks"][MAIN], out.with_suffix(".png"))

@@ -187,7 +187,7 @@ class Stage:
         safety, place = self.safety, air.simulation.truth_position_m
         hull = (safety.vehicle_radius_m, safety.vehicle_radius_m, safety.vehicle_half_height_m)
         for axis in range(3):
-            margins = [safety.fence.max_m[axis] - place[axis], place[axis] - safety.fence.min_m[axis]]
+            margins = [safety.fence.high_m[axis] - place[axis], place[axis] - safety.fence.low_m[axis]]
             lands = axis == 2 and air.autopilot.mode is not FlightMode.OFFBOARD
             trace.fence_margin_m = min(trace.fence_margin_m, min(margins[:1] if lands else margins) - hull[axis])
 

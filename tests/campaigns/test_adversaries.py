@@ -131,7 +131,7 @@ def test_the_judge_counts_crossings_and_contacts_once_each():
 
 def test_the_judge_lets_braking_pass_and_counts_jumps():
     judge = Judge(make_scene("box", np.random.default_rng(0)))
-    for x, y in ((0.5, 0.0), (1.0, 0.0), (0.0, 0.0), (0.5, 0.0), (0.2, 0.0)):
+    for x, y in ((0.5, 0.0), (1.0, 0.0), (0.0, 0.0), (0.35, 0.0), (0.2, 0.0)):
         judge.sent(SafeCommand(CorridorVector(x, y, 0.0), 0.0), 0.0)
     assert judge.outcome.events == {}
     judge.sent(SafeCommand(CorridorVector(-0.7, 0.0, 0.0), 0.0), 0.0)

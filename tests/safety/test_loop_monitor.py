@@ -117,7 +117,7 @@ def test_the_same_echo_again_is_not_judged_again():
 
 
 def test_foreign_setpoints_between_ours_are_seen_and_a_few_accuse_nobody():
-    """K6: a second sender is echoed in turn with us; six foreign echoes over 0.6 s, within a second, are enough."""
+    """K6: a second sender at the same rate is echoed in turn with us; six foreign echoes within 1 s, over 0.6 s, are enough."""
 
     def mixed(every: int) -> list[list[str]]:
         foreign = CorridorVector(0, -1, 0)
