@@ -1,7 +1,8 @@
 """How much unseen space a brake tube leads through, compared with what braking itself would need.
 
 A command may lead through no unseen cell, or, when braking itself does (start in the unseen, drift, memory run out), through no
-more than braking. Counted with one cell to spare, so that the grid's own steps are no breach: only the exact count slows down.
+more than braking, and to a stop no nearer to any: without that, small steps would add up. Counted with one cell to spare, so that
+the grid's own steps are no breach: only the exact count slows down.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from safety.free_space import STEP_M, FreeSpace
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 Booleans = NDArray[np.bool_]
+ROUNDING_M = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,18 +39,23 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Hidden:
-    """Unseen cells on tubes [c], at the worst place of each: with one cell to spare, and exactly (0 where `wide` is)."""
+    """Unseen cells on tubes [c], at the worst place of each: with one cell to spare, and exactly.
+
+    `gap_m` [c]: from the stop points to the nearest unseen cell; inf when no tube touches any.
+    """
 
     wide: Integers
     exact: Integers
+    gap_m: Floats
 
     def rows(self, chosen: slice) -> Hidden:
         """The counts of some tubes."""
-        return Hidden(self.wide[chosen], self.exact[chosen])
+        return Hidden(self.wide[chosen], self.exact[chosen], self.gap_m[chosen])
 
     def permits(self, others: Hidden) -> Booleans:
-        """Which tubes lead through no more than this one."""
-        permitted: Booleans = (others.wide <= self.wide) & (others.exact <= self.exact)
+        """Which tubes see enough: they touch nothing unseen, or this one does and they lead no further in."""
+        no_more = (others.wide <= self.wide) & (others.exact <= self.exact) & (others.gap_m >= self.gap_m - ROUNDING_M)
+        permitted: Booleans = (others.wide == 0) | no_more
         return permitted
 
 
@@ -70,5 +77,8 @@ class Sight:
         x, y = (tube.turn_m[..., axis, None] + leg[..., axis, None] * self._shares for axis in (0, 1))
         wide = view.free.unseen(x, y, view.near_m, view.now_s, wide=True).max(axis=(0, 2))
         if not wide.any():
-            return Hidden(wide, wide)
-        return Hidden(wide, view.free.unseen(x, y, view.near_m, view.now_s, wide=False).max(axis=(0, 2)))
+            return Hidden(wide, wide, np.full(wide.shape, np.inf))
+        exact = view.free.unseen(x, y, view.near_m, view.now_s, wide=False).max(axis=(0, 2))
+        stop_x, stop_y = tube.stop_m[..., 0].reshape(-1), tube.stop_m[..., 1].reshape(-1)
+        gaps = view.free.gap_m(stop_x, stop_y, view.near_m, view.now_s).reshape(2, -1).min(axis=0)
+        return Hidden(wide, exact, gaps)
