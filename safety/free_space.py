@@ -41,6 +41,7 @@ class FreeSpace:
         self._spare = np.empty_like(self._seen_s)
         hull = config.vehicle_radius_m + config.position_error_m + config.velocity_error_m_s * config.delay_s + _sagitta_m(config)
         self._kernels = (_boxes(hull + CELL_M), _boxes(hull))
+        self._rim = int(self._kernels[0].max())
         self._hull = _disc(config.vehicle_radius_m)
         self._vicinity = _disc(hull + (1 + VICINITY_CELLS) * CELL_M)
         self.clear()
@@ -114,9 +115,17 @@ class FreeSpace:
         counts: Integers = _box_counts(hidden, boxes, rim)[ix - (low_x + rim), iy - (low_y + rim)]
         return counts
 
+    def all_seen_around(self, x_m: float, y_m: float, now_s: float) -> bool:
+        """Whether every cell that the hull could touch around a place was seen: quick, and False where it must be counted."""
+        i, j, rim = _cell(x_m) - self._corner[0], _cell(y_m) - self._corner[1], self._rim
+        if min(i, j) < rim or max(i, j) >= SIDE_CELLS - rim or self._began_s is None:
+            return False
+        around = self._seen_s[i - rim : i + rim + 1, j - rim : j + rim + 1]
+        return bool(around.min() >= now_s - self._began_s - self._config.memory_s)
+
     def gap_m(self, x_m: Floats, y_m: Floats, near_m: Floats, now_s: float) -> Floats:
         """Distance from places x, y [n] to the nearest unseen cell, m; what is further than the hull needs reads as that."""
-        rim = int(self._kernels[0].max())
+        rim = self._rim
         ix, iy = self._indices(x_m, 0), self._indices(y_m, 1)
         low_x, low_y = int(ix.min()) - rim, int(iy.min()) - rim
         hidden = self._hidden(low_x, low_y, int(ix.max()) + rim + 1, int(iy.max()) + rim + 1, near_m, now_s)

@@ -171,7 +171,7 @@ class Shield:
         passed = np.flatnonzero(bounds.allowed.permits(candidates, self._tube_clearances(tube, around), rooms))
         if passed.shape[0] == 0:
             return passed
-        return passed[bounds.hidden.permits(self._sight.hidden(tube.rows(passed), around.view))]
+        return passed[bounds.hidden.permits(self._sight.hidden(tube.rows(passed), around.view, bounds.hidden))]
 
     def _candidates(self, wanted: Floats, around: Surroundings, allowed: Allowance) -> Floats:
         """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""

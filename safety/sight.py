@@ -41,7 +41,7 @@ class View:
 class Hidden:
     """Unseen cells on tubes [c], at the worst place of each: with one cell to spare, and exactly.
 
-    `gap_m` [c]: from the stop points to the nearest unseen cell; inf when no tube touches any.
+    `gap_m` [c]: from the stop points to the nearest unseen cell.
     """
 
     wide: Integers
@@ -68,16 +68,21 @@ class Sight:
 
     def lost(self, position: CorridorVector, view: View) -> bool:
         """Whether the vehicle is in unseen space."""
+        if view.free.all_seen_around(position.x, position.y, view.now_s):  # the usual case
+            return False
         x, y = np.array((position.x,)), np.array((position.y,))
         return bool(view.free.unseen(x, y, view.near_m, view.now_s, wide=False)[0])
 
-    def hidden(self, tube: Tubes, view: View) -> Hidden:
-        """The unseen cells on each tube, of both models."""
+    def hidden(self, tube: Tubes, view: View, brake: Hidden | None = None) -> Hidden:
+        """The unseen cells on each tube, of both models. Without `brake` the last tube is braking's own.
+
+        Where braking touches nothing unseen nothing else may, and only `wide` is counted.
+        """
         leg = tube.stop_m - tube.turn_m
         x, y = (tube.turn_m[..., axis, None] + leg[..., axis, None] * self._shares for axis in (0, 1))
         wide = view.free.unseen(x, y, view.near_m, view.now_s, wide=True).max(axis=(0, 2))
-        if not wide.any():
-            return Hidden(wide, wide, np.full(wide.shape, np.inf))
+        if (wide if brake is None else brake.wide)[-1] == 0:
+            return Hidden(wide, wide, np.zeros(wide.shape))
         exact = view.free.unseen(x, y, view.near_m, view.now_s, wide=False).max(axis=(0, 2))
         stop_x, stop_y = tube.stop_m[..., 0].reshape(-1), tube.stop_m[..., 1].reshape(-1)
         gaps = view.free.gap_m(stop_x, stop_y, view.near_m, view.now_s).reshape(2, -1).min(axis=0)
