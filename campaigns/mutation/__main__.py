@@ -9,7 +9,6 @@ Verdicts are kept in --work, so that a stopped run goes on where it was; after s
 from __future__ import annotations
 
 import argparse
-import hashlib
 import importlib.metadata
 import json
 import math
@@ -26,7 +25,8 @@ from campaigns.mutation.ledger import KILLED, Ledger, Verdict
 from campaigns.mutation.mutants import Mutant, sources
 from campaigns.mutation.probe import EXAMPLES
 from campaigns.mutation.report import collect, figures, load_equivalents
-from campaigns.mutation.testmap import TESTS, BaselineError, TestMap
+from campaigns.mutation.suite import properties, suite_digest
+from campaigns.mutation.testmap import BaselineError, TestMap
 
 
 def options() -> argparse.Namespace:
@@ -40,12 +40,6 @@ def options() -> argparse.Namespace:
     parser.add_argument("--budget-s", type=float, default=math.inf, help="per mutant, only the fastest tests of this much time")
     parser.add_argument("--list", action="store_true", help="print the survivors that have no proof")
     return parser.parse_args()
-
-
-def suite_digest(root: Path, budget_s: float) -> str:
-    """Identifies the tests that a survivor has survived."""
-    text = "".join(path.read_text() for path in sorted((root / TESTS).rglob("*.py")))
-    return hashlib.sha256(f"{text}{budget_s}".encode()).hexdigest()
 
 
 def show(mutant: Mutant, verdict: Verdict) -> None:
@@ -74,6 +68,7 @@ def main() -> int:
     result |= {
         "cosmic_ray": importlib.metadata.version("cosmic-ray"),
         "tests": len(tests.seconds),
+        "properties": len(properties(root)),
         "examples_per_property": EXAMPLES,
         "seconds": time.monotonic() - begin,
         "command": "python -m campaigns.mutation --out results/mutation.json",

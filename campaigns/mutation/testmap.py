@@ -16,8 +16,8 @@ import pytest
 from campaigns.mutation.forks import Answer, Job, run_forked
 from campaigns.mutation.mutants import definitions, sources
 from campaigns.mutation.probe import fixed_examples, run_tests
+from campaigns.mutation.suite import TESTS
 
-TESTS = "tests/safety"
 OWN = ("safety", "campaigns", "flight", "training", "policy_export", "tests", "test_", "safety_", "conftest", "__main__")
 RECORD_CPU_S = 900.0
 Lines = dict[str, dict[int, list[str]]]  # file -> line -> tests that ran it; "" = while importing
