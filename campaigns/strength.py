@@ -19,8 +19,8 @@ def mutation(result: dict[str, Any]) -> str:
     """The score per file, and what is not killed."""
     real = result["mutants"] - result["only_annotations"]
     text = (
-        f"`{result['command']}`: cosmic-ray {result['cosmic_ray']} makes {result['mutants']} mutants, {result['only_annotations']} of "
-        f"which change annotations that never run. Of the other {real}, {result['killed']} are killed "
+        f"`{result['command']}`: cosmic-ray {result['cosmic_ray']} makes {result['mutants']} mutants, "
+        f"{result['only_annotations']} of which change annotations that never run. Of the other {real}, {result['killed']} are killed "
         f"({100 * result['score']:.2f} %), {result['proved_equivalent']} are proved equivalent one by one "
         f"({100 * result['equivalent_share']:.2f} %, `tests/safety/equivalent_mutants.json`), {result['unexplained']} survive "
         f"unexplained ({result['timeout']} of them ran out of time, which is no kill), {result['not_run']} were not run. "
@@ -48,7 +48,7 @@ def crosscheck(result: dict[str, Any]) -> str:
 def accidents(result: dict[str, Any]) -> str:
     """How many accidents were noticed."""
     return (
-        f"`{result['command']}`: {result['accidents']} accidents written by hand (`tests/safety/accidents/`: fail-open returns, order "
-        f"swapped, one edge only, delay or error left out, NaN let through, mirrored scan and their like), "
+        f"`{result['command']}`: {result['accidents']} accidents written by hand (`tests/safety/accidents/`: fail-open returns, "
+        f"order swapped, one edge only, delay or error left out, NaN let through, mirrored scan and their like), "
         f"{result['noticed_by_two_tests_or_more']} of them noticed by two tests or more."
     )

@@ -21,10 +21,10 @@ def properties(root: Path) -> list[str]:
     found = []
     for path in sorted((root / TESTS).rglob("test_*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.FunctionDef) and any(_is_given(decorator) for decorator in node.decorator_list):
-                found.append(f"{path.name}::{node.name}")
-            elif isinstance(node, ast.ClassDef) and any("StateMachine" in ast.dump(base) for base in node.bases):
-                found.append(f"{path.name}::{node.name}")
+            given = isinstance(node, ast.FunctionDef) and any(_is_given(decorator) for decorator in node.decorator_list)
+            machine = isinstance(node, ast.ClassDef) and any("StateMachine" in ast.dump(base) for base in node.bases)
+            if given or machine:
+                found.append(f"{path.name}::{getattr(node, 'name', '')}")
     return found
 
 
