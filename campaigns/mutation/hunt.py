@@ -19,7 +19,7 @@ from campaigns.mutation.testmap import TestMap
 
 CPU_SLACK_S = 10.0
 CPU_PER_SECOND = 3.0  # a mutant may make its tests this much slower before it is stopped
-FIRST_TESTS = 6  # tried by themselves: most mutants fall here
+FIRST_TESTS = 6  # of one file, tried by themselves: most mutants fall here
 Report = Callable[[Mutant, Verdict], None]
 
 
@@ -64,7 +64,8 @@ class Hunt:
         if self._file.same_program(changed):
             return result
         swap(self.root, {self.path: changed})
-        for part in (order[:FIRST_TESTS], order[FIRST_TESTS:]):
+        first = [name for name in order if name.partition("::")[0] == order[0].partition("::")[0]][:FIRST_TESTS]
+        for part in (first, [name for name in order if name not in first]):
             if part and not result["failed"]:
                 files = list(dict.fromkeys(name.partition("::")[0] for name in part))
                 probe = run_tests(self.root, files, part, 1)
