@@ -20,11 +20,11 @@ def mutation(result: dict[str, Any]) -> str:
     real = result["mutants"] - result["only_annotations"]
     text = (
         f"`{result['command']}`: cosmic-ray {result['cosmic_ray']} makes {result['mutants']} mutants, "
-        f"{result['only_annotations']} of which change annotations that never run. Of the other {real}, "
-        f"{result['killed']} are killed ({100 * result['score']:.2f} %), {result['proved_equivalent']} are proved equivalent one by one "
-        f"({100 * result['equivalent_share']:.2f} %, `tests/safety/equivalent_mutants.json`), {result['unexplained']} survive "
-        f"unexplained ({result['timeout']} of them ran out of time, which is no kill), {result['not_run']} were not run. "
-        f"{result['tests']} tests, {result['properties']} of them properties of hypothesis."
+        f"{result['only_annotations']} of which change annotations that never run. Of the other {real}, {result['killed']} "
+        f"are killed ({100 * result['score']:.2f} %), {result['proved_equivalent']} are proved equivalent one by one "
+        f"({100 * result['equivalent_share']:.2f} %, `tests/safety/equivalent_mutants.json`), {result['unexplained']} "
+        f"survive unexplained ({result['timeout']} of them ran out of time, which is no kill), {result['not_run']} were "
+        f"not run. {result['tests']} tests, {result['properties']} of them properties of hypothesis."
     )
     rows = [
         f"| `{path}` | {counts['mutants']} | {counts.get('killed', 0)} | {counts.get('proved equivalent', 0)} | {_open(counts)} |"

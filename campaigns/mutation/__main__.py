@@ -20,7 +20,7 @@ from pathlib import Path
 for _name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-from campaigns.mutation.hunt import hunt_file
+from campaigns.mutation.hunt import Task, hunt_all
 from campaigns.mutation.ledger import KILLED, Ledger, Verdict
 from campaigns.mutation.mutants import Mutant, sources
 from campaigns.mutation.probe import EXAMPLES
@@ -60,8 +60,8 @@ def main() -> int:
     tests = TestMap(root, chosen.work / "tests.json")
     print(f"recorded: {', '.join(tests.refresh(chosen.jobs)) or 'nothing new'}", flush=True)
     suite = suite_digest(root, chosen.budget_s)
-    for path in chosen.module or sources(root):
-        hunt_file(root, path, tests, ledger_path, suite, chosen.budget_s, chosen.jobs, show)
+    paths = chosen.module or list(sources(root))
+    hunt_all(Task(root, paths, tests, ledger_path, suite, chosen.budget_s, chosen.jobs, show))
     ledger = Ledger(ledger_path)
     result = figures(collect(root, ledger, suite), load_equivalents())
     ledger.close()

@@ -53,6 +53,15 @@ def swap(root: Path, sources: dict[str, str]) -> None:
     sys.meta_path.insert(0, _Swapped(root, sources))
 
 
+def forget(root: Path, kept: tuple[str, ...] = ("campaigns.mutation", "sim_gateway", "strict_yaml")) -> None:
+    """Drop every imported module that lies under `root`, but for those that know nothing of what may be swapped."""
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        ours = file is not None and Path(file).is_relative_to(root)
+        if ours and name not in {"campaigns", "__main__"} and not name.startswith(kept):
+            del sys.modules[name]
+
+
 def preload(names: Iterable[str]) -> None:
     """Import modules now, so that forked children need not."""
     for name in names:

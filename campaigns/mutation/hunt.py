@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import random
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -10,11 +12,14 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import pytest
+
 from campaigns.mutation.forks import Answer, Job, run_forked
-from campaigns.mutation.hotswap import preload, swap, unaffected
+from campaigns.mutation.hotswap import forget, module_name, swap
+from campaigns.mutation.inplace import function_at, replace
 from campaigns.mutation.ledger import KILLED, NO_CHANGE, SURVIVED, TIMEOUT, Ledger, Verdict
 from campaigns.mutation.mutants import Mutant, SourceFile, changed_lines, mutants_of, sources
-from campaigns.mutation.probe import fixed_examples, run_tests
+from campaigns.mutation.probe import Probe, fixed_examples, run_tests
 from campaigns.mutation.testmap import TestMap
 
 CPU_SLACK_S = 10.0
@@ -37,6 +42,7 @@ class Hunt:
         self._sources = sources(self.root)
         self.source = self._sources[self.path]
         self._seconds = self.tests.seconds
+        self._file = SourceFile(self.path, self.source)
 
     def order(self, mutant: Mutant) -> list[str]:
         """Tests for a mutant: recent killers in the same function first, then those that run the line, fast before slow."""
@@ -50,31 +56,40 @@ class Hunt:
                 chosen.append(name)
         return chosen
 
-    def prepare(self) -> None:
-        """In the process that will fork: import all that the change cannot touch."""
-        fixed_examples()
-        preload([*self.tests.modules, *unaffected(self._sources, {self.path})])
-        self._file = SourceFile(self.path, self.source)
-
-    def probe(self, mutant: Mutant, order: list[str]) -> Answer:
+    def probe(self, mutant: Mutant, order: list[str], session: pytest.Session) -> Answer:
         """In the child: make the mutant and run its tests until one fails."""
         changed = self._file.changed(mutant)
         before, after = changed_lines(self.source, changed)
         result: Answer = {"before": before, "after": after, "failed": {}, "tests": 0}
         if self._file.same_program(changed):
             return result
+        if self._changed_in_place(mutant, changed):
+            return result | run_items(session, order)
+        return result | self._imported_anew(changed, order)
+
+    def _changed_in_place(self, mutant: Mutant, changed: str) -> bool:
+        """Give one function its changed code, where nothing has run it yet."""
+        name = function_at(self.source, mutant.line)
+        if name is None or self.tests.runs_on_import(self.path, self.source, mutant.line) or not _compiles(changed):
+            return False
+        return replace(module_name(self.path), name, changed, str(self.root / self.path))
+
+    def _imported_anew(self, changed: str, order: list[str]) -> Answer:
+        """Forget all of ours that is imported, and import it with the change: a test file first, then the rest."""
+        forget(self.root)
         swap(self.root, {self.path: changed})
         first = [name for name in order if name.partition("::")[0] == order[0].partition("::")[0]][:FIRST_TESTS]
+        tests = 0
         for part in (first, [name for name in order if name not in first]):
-            if part and not result["failed"]:
-                files = list(dict.fromkeys(name.partition("::")[0] for name in part))
-                probe = run_tests(self.root, files, part, 1)
-                result["failed"] = probe.failed
-                result["tests"] += len(probe.seconds)
-        return result
+            if part:
+                probe = run_tests(self.root, list(dict.fromkeys(name.partition("::")[0] for name in part)), part, 1)
+                tests += len(probe.seconds)
+                if probe.failed:
+                    return {"failed": probe.failed, "tests": tests}
+        return {"failed": {}, "tests": tests}
 
-    def run(self, mutants: list[Mutant], at_once: int) -> Iterator[tuple[Mutant, Verdict]]:
-        """All verdicts, as they come."""
+    def run(self, mutants: list[Mutant], at_once: int, session: pytest.Session) -> Iterator[tuple[Mutant, Verdict]]:
+        """All verdicts, as they come. `session`: pytest's, everything collected."""
         begun: dict[Mutant, float] = {}
 
         def jobs() -> Iterator[Job[Mutant]]:
@@ -82,7 +97,7 @@ class Hunt:
                 order = self.order(mutant)
                 begun[mutant] = time.monotonic()
                 expected = sum(self._seconds[name] for name in order)
-                yield Job(mutant, partial(self.probe, mutant, order), CPU_SLACK_S + CPU_PER_SECOND * expected)
+                yield Job(mutant, partial(self.probe, mutant, order, session), CPU_SLACK_S + CPU_PER_SECOND * expected)
 
         for mutant, answer in run_forked(jobs(), at_once):
             verdict = judged(answer, time.monotonic() - begun.pop(mutant))
@@ -111,31 +126,70 @@ def judged(answer: Answer, seconds: float) -> Verdict:
     return Verdict(outcome, killer, answer["tests"], answer["before"], answer["after"], seconds)
 
 
-def hunt_file(
-    root: Path, path: str, tests: TestMap, ledger_path: Path, suite: str, budget_s: float, at_once: int, report: Report
-) -> None:
-    """Run the mutants of one file that have no verdict yet, in a process of its own (what it imports stays there)."""
+def _compiles(source: str) -> bool:
+    try:
+        compile(source, "changed", "exec", dont_inherit=True)
+    except (SyntaxError, ValueError):
+        return False
+    return True
+
+
+def run_items(session: pytest.Session, order: list[str]) -> Answer:
+    """Run collected tests in this order until one fails."""
+    probe = next(plugin for plugin in session.config.pluginmanager.get_plugins() if isinstance(plugin, Probe))
+    items = {item.nodeid: item for item in session.items}
+    for name in order:
+        session.config.hook.pytest_runtest_protocol(item=items[name], nextitem=None)
+        if probe.failed:
+            break
+    return {"failed": probe.failed, "tests": len(probe.seconds)}
+
+
+@dataclass(frozen=True)
+class Task:
+    """What to hunt: files, and how."""
+
+    root: Path
+    paths: list[str]
+    tests: TestMap
+    ledger: Path
+    suite: str
+    budget_s: float
+    at_once: int
+    report: Report
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """In place of running the tests once: with everything imported and collected, fork for every mutant."""
+        ledger = Ledger(self.ledger)
+        for path in self.paths:
+            hunt = Hunt(self.root, path, self.tests, self.budget_s)
+            known = ledger.known(path, hunt.source, self.suite)
+            pending = [m for m in mutants_of(path, hunt.source) if (m.operator, m.occurrence) not in known]
+            random.Random(path).shuffle(pending)  # a run that is stopped has seen a fair sample
+            for mutant, verdict in hunt.run(pending, self.at_once, session):
+                ledger.add(mutant, hunt.source, self.suite, verdict)
+                self.report(mutant, verdict)
+        ledger.close()
+        return True
+
+
+def hunt_all(task: Task) -> None:
+    """Run the mutants that have no verdict yet, in a process of its own (what it imports stays there)."""
     pid = os.fork()
     if pid:
         status = os.waitpid(pid, 0)[1]
         if status:
-            raise ChildProcessError(f"{path}: the process that hunts its mutants ended with status {status}")
+            raise ChildProcessError(f"the process that hunts mutants ended with status {status}")
         return
     code = 1
     try:
-        _hunt_here(Hunt(root, path, tests, budget_s), Ledger(ledger_path), suite, at_once, report)
-        code = 0
+        fixed_examples()
+        probe = run_tests(task.root, list(task.tests.files), None, 0, (task,))
+        code = 0 if not probe.failed else 1
+        sys.stderr.write("".join(probe.failed.values()))
     except BaseException:
         traceback.print_exc()
         raise
     finally:
         os._exit(code)
-
-
-def _hunt_here(hunt: Hunt, ledger: Ledger, suite: str, at_once: int, report: Report) -> None:
-    known = ledger.known(hunt.path, hunt.source, suite)
-    pending = [m for m in mutants_of(hunt.path, hunt.source) if (m.operator, m.occurrence) not in known]
-    hunt.prepare()
-    for mutant, verdict in hunt.run(pending, at_once):
-        ledger.add(mutant, hunt.source, suite, verdict)
-        report(mutant, verdict)

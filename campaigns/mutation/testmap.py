@@ -123,15 +123,25 @@ class TestMap:
     def covering(self, path: str, source: str, line: int) -> tuple[list[str], set[str]]:
         """Tests that can notice a change of a line, and those of them that run the very line."""
         span = definitions(source).get(line)
-        found: dict[str, None] = {}
+        found: list[str] = []
         exact: set[str] = set()
         for one in self.files.values():
             ran = one.lines.get(path, {})
             exact |= set(ran.get(line, ())) - {""}
-            inside = {test for at, tests in ran.items() if span is None or span[0] <= at <= span[1] for test in tests}
+            inside = _ran_in(ran, span)
             names = one.seconds if "" in inside else inside  # run while importing: any test of the file may notice
-            found |= dict.fromkeys(name for name in one.seconds if name in names)
-        return list(found), exact
+            found += [name for name in one.seconds if name in names]
+        return found, exact
+
+    def runs_on_import(self, path: str, source: str, line: int) -> bool:
+        """Whether the function that holds a line runs while some test file is imported."""
+        span = definitions(source).get(line)
+        return any("" in _ran_in(one.lines.get(path, {}), span) for one in self.files.values())
+
+
+def _ran_in(ran: dict[int, list[str]], span: tuple[int, int] | None) -> set[str]:
+    """Tests that ran any line of a span (of the whole file when None)."""
+    return {test for at, tests in ran.items() if span is None or span[0] <= at <= span[1] for test in tests}
 
 
 def _file_map(kept: Answer) -> FileMap:
