@@ -104,6 +104,8 @@ def _hardware_priority(flight: int) -> None:
     """Real-time priority for every thread of the simulator that `fly` has started, where it is permitted."""
     children = " ".join(path.read_text() for path in Path(f"/proc/{flight}/task").glob("*/children"))
     for child in children.split():
+        if "sim_gateway" not in Path(f"/proc/{child}/cmdline").read_text():
+            continue  # the guard has its own
         for thread in Path(f"/proc/{child}/task").glob("*"):
             with suppress(PermissionError, ProcessLookupError):
                 os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(GATEWAY_PRIORITY))

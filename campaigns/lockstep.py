@@ -21,7 +21,7 @@ from policy_export.runner import PolicyRunner
 from safety.config import SafetyConfig
 from safety.filter import SafetyFilter
 from safety.frames import CorridorVector
-from safety.messages import BRAKE, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
+from safety.messages import BRAKE, Health, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
 from sim_gateway.collision import clearance_m
 from sim_gateway.lidar import LidarConfig
 from sim_gateway.paths import shortest_path_length
@@ -63,7 +63,12 @@ class Unfiltered(SafetyFilter):
     """Stands where the safety filter stands, and passes everything: only to measure what the filter costs and saves."""
 
     def apply(
-        self, command: VelocityCommand | None, state: VehicleState | None, scan: LidarScan | None, now_s: float
+        self,
+        command: VelocityCommand | None,
+        state: VehicleState | None,
+        scan: LidarScan | None,
+        now_s: float,
+        health: Health | None = None,
     ) -> tuple[SafeCommand, Verdict]:
         """The command as it is; BRAKE without one."""
         wanted = command or BRAKE

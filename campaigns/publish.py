@@ -1,4 +1,4 @@
-"""Write what was measured where people read it: model cards beside the policies, and the table in the README.
+"""Write what was measured where people read it: model cards beside the policies, the tables in README and docs/safety.md.
 
     python -m campaigns.publish
 
@@ -12,13 +12,16 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from campaigns.process_death import markdown
 from policy_export.errors import PolicyError
 from policy_export.policy_file import PolicyFile, read_policy_file
 
 RESULTS = Path("results")
 POLICIES = Path("policies")
 README = Path("README.md")
+SAFETY = Path("docs/safety.md")
 BEGIN, END = "<!-- results -->", "<!-- end of results -->"
+PROCESS_DEATH = "<!-- process death -->", "<!-- end of process death -->"
 PAPER_UNSEEN_SUCCESS = "77.4 %"
 PAPER_PATH_EFFICIENCY = "0.85"
 
@@ -115,16 +118,30 @@ layer.
 
 
 def publish() -> None:
-    """Write the cards and the README table."""
+    """Write the cards and the tables."""
     results = read_results()
     for path in sorted(POLICIES.glob("*.onnx")):
         path.with_suffix(".md").write_text(model_card(read_policy_file(path), path, results))
-    text = README.read_text()
-    before, _, rest = text.partition(BEGIN)
-    _, found, after = rest.partition(END)
     note = f"The article: {PAPER_UNSEEN_SUCCESS} success in unseen worlds (31 flights), path efficiency {PAPER_PATH_EFFICIENCY}."
-    block = f"{BEGIN}\n{table(lockstep_rows(results) + realtime_rows(results))}\n\n{note}\n{END}"
-    README.write_text(before + block + (after if found else rest))
+    _write_block(README, BEGIN, END, f"{table(lockstep_rows(results) + realtime_rows(results))}\n\n{note}")
+    if "process_death" in results:
+        _write_block(SAFETY, *PROCESS_DEATH, process_death(results["process_death"]))
+
+
+def process_death(result: dict[str, Any]) -> str:
+    """The process-death matrix and its sum."""
+    total = (
+        f"`{result['command']}`: {result['good']} of {result['runs']} runs good, {result['late_moving_setpoints']} moving "
+        f"setpoints too late, {result['contacts']} contacts; load average at the end {result['load_average_at_end']}."
+    )
+    return f"{markdown(result)}\n\n{total}"
+
+
+def _write_block(path: Path, begin: str, end: str, block: str) -> None:
+    """Replace what stands between two marks, or add it at the end."""
+    before, _, rest = path.read_text().partition(begin)
+    _, found, after = rest.partition(end)
+    path.write_text(f"{before}{begin}\n{block}\n{end}" + (after if found else rest))
 
 
 if __name__ == "__main__":

@@ -29,10 +29,11 @@ class Landing:
         interrupt: Interrupt,
         land_timeout_s: float,
         clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.events: list[str] = []
         self._link, self._status, self._interrupt = link, status, interrupt
-        self._land_timeout_s, self._clock = land_timeout_s, clock
+        self._land_timeout_s, self._clock, self._sleep = land_timeout_s, clock, sleep
 
     def land(self, keep_alive: Callable[[], None] | None = None) -> bool:
         """Hold, then land. `keep_alive` keeps the setpoint stream up until PX4 has left OFFBOARD."""
@@ -72,6 +73,9 @@ class Landing:
         while self._clock() < deadline:
             if self._link.telemetry.armed is False:
                 return True
+            if self._link.guard.lost is not None:
+                self.events.append(self._link.guard.lost)
+                return False
             if self._interrupt.count > max(signals, 1):
                 self.events.append("not waited for: PX4 is landing")
                 return False
@@ -81,7 +85,7 @@ class Landing:
                 foreign_since = self._clock()
             elif self._clock() - foreign_since > FOREIGN_MODE_S:
                 return self._yield(f"mode {mode_name(self._link.mode)} was not commanded by fly")
-            time.sleep(0.02)
+            self._sleep(0.02)
         self.events.append(f"not disarmed {self._land_timeout_s:g} s after the landing command: check the vehicle")
         self._status.phase(self.events[-1])
         return False

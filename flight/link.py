@@ -1,8 +1,9 @@
 """The vehicle over MAVSDK: telemetry in, one-shot velocity setpoints and commands with deadlines out.
 
-Setpoints go out as single SET_POSITION_TARGET_LOCAL_NED messages through MAVSDK's direct-message plugin. MAVSDK's
-Offboard plugin is never used: it repeats the last setpoint by itself for ever, so a hung program would fly on and PX4's
-own offboard-loss action would never come. Here, when the program stops, the stream stops.
+The wire belongs to a process of its own, the guard (`flight.guard`): MAVSDK talks through it, and setpoints go to it, not to
+MAVSDK. The guard sends each one once, only while it is young; when this program stops, hangs or dies, it brakes and falls
+silent, so that PX4's own offboard-loss action comes. MAVSDK's Offboard plugin is never used: it repeats the last setpoint by
+itself for ever.
 
 Everything MAVSDK calls back arrives on its own thread and only replaces the newest sample (`flight.telemetry`).
 """
@@ -21,19 +22,19 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from flight.authority import Authority
-from flight.errors import MissionError, NoVehicleError, RefusedError, VehicleCommandError
+from flight.errors import NoVehicleError, RefusedError, VehicleCommandError
+from flight.guard.client import GuardLostError, SetpointGuard
+from flight.guard.core import State
 from flight.px4 import (
     AUTOPILOT_COMPONENT,
     AUTOPILOT_PX4,
     COMMAND_DO_SET_MODE,
     COMMAND_REQUEST_MESSAGE,
     COMMAND_SET_MESSAGE_INTERVAL,
-    FRAME_LOCAL_NED,
     MESSAGE_ID,
     MODE_FLAG_CUSTOM,
     RESULT_ACCEPTED,
     RESULT_NAMES,
-    TYPE_MASK_VELOCITY_YAW_RATE,
     FlightMode,
     mode_name,
 )
@@ -46,6 +47,8 @@ log = logging.getLogger("flight.link")
 COMMAND_DEADLINE_S = 3.0
 MODE_DEADLINE_S = 3.0
 POLL_S = 0.01
+REPORT_RATE_HZ = 10.0
+"""Of what the autopilot says about itself: often enough for the safety layer's bounds."""
 OWN_SYSTEM_ID = 245
 OWN_COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 LOOPBACK_HOSTS = ("127.0.0.1", "localhost", "::1")
@@ -62,14 +65,23 @@ class VehicleLink:
     arming and takeoff raises `ControlLostError` before anything is sent.
     """
 
-    def __init__(self, url: str, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        url: str,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        guard_priority: int = 0,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """`guard_priority`: SCHED_FIFO priority of the guard where it is permitted, 0 for usual scheduling."""
         self.url = url
+        self.guard = SetpointGuard(url, guard_priority)
         self.telemetry = Telemetry()
         self.system: Any = None
         self.system_id = 0
         self.setpoints_sent = 0
         self.authority: Authority | None = None
-        self._clock = clock
+        self._clock, self._sleep = clock, sleep
         self._mavsdk: Any = None
         self._direct: Any = None
         self._action: Any = None
@@ -92,11 +104,12 @@ class VehicleLink:
         check_port_is_free(self.url)
         _route_mavsdk_log()
         deadline = self._clock() + timeout_s
+        self.guard.start(timeout_s, keep_waiting)
         configuration = Configuration.create_manual(OWN_SYSTEM_ID, OWN_COMPONENT_ID, True)
         self._mavsdk = Mavsdk(configuration)
-        result = self._mavsdk.add_any_connection(self.url)
+        result = self._mavsdk.add_any_connection(self.guard.relay_url)
         if result != ConnectionResult.SUCCESS:
-            raise _connection_error(self.url, result.name)
+            raise RefusedError(f"MAVSDK cannot connect to the guard of {self.url}: {result.name}")
         system = self._wait_for_autopilot(deadline, keep_waiting)
         if system is None:
             raise NoVehicleError(
@@ -142,6 +155,7 @@ class VehicleLink:
         self._direct = self._action = self._param = None
         if mavsdk is not None:
             mavsdk.destroy()
+        self.guard.close()
 
     # -- telemetry ----------------------------------------------------------------------------------------------
 
@@ -204,40 +218,49 @@ class VehicleLink:
         """Ask for the messages the loop lives on at `rate_hz`. Raises `VehicleCommandError` when PX4 refuses."""
         for name in ("LOCAL_POSITION_NED", "ATTITUDE", "HIGHRES_IMU"):
             self.request_message_rate(name, rate_hz)
+        for name in ("ODOMETRY", "ESTIMATOR_STATUS", "POSITION_TARGET_LOCAL_NED"):
+            self.request_message_rate(name, REPORT_RATE_HZ)
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float, keep_alive: Callable[[], None] | None = None) -> bool:
-        """Poll `condition` every 10 ms until it holds (True) or `timeout_s` passed (False)."""
+        """Poll `condition` every 10 ms until it holds (True) or `timeout_s` passed (False). Raises `GuardLostError`."""
         deadline = self._clock() + timeout_s
         while not condition():
             if self._clock() >= deadline:
                 return False
+            if self.guard.lost is not None:
+                raise GuardLostError(self.guard.lost)
             if keep_alive is not None:
                 keep_alive()
-            time.sleep(POLL_S)
+            self._sleep(POLL_S)
         return True
 
     # -- setpoints ----------------------------------------------------------------------------------------------
 
-    def send_velocity(self, command: SafeCommand, frame: CorridorFrame) -> float:
-        """Send one velocity setpoint; returns the time of the send. The last gate before the wire: not finite is refused.
+    def open_stream(self) -> None:
+        """Begin an engagement: without it the guard sends no setpoint. Raises `VehicleCommandError` when the guard is gone."""
+        self.require_control()
+        self.guard.engage(self._target)
 
-        Raises `ValueError` on a number that is not finite, `ControlLostError` when the vehicle is not ours any more,
-        `VehicleCommandError` when the link cannot send.
+    def close_stream(self) -> None:
+        """No setpoint from now on, not even a braking one. Never raises."""
+        self.guard.disengage()
+
+    def send_velocity(self, command: SafeCommand, frame: CorridorFrame, decided_s: float | None = None) -> float | None:
+        """Send one velocity setpoint; returns when it went out, None where the guard held it back (too old, stream closed).
+
+        `decided_s`: when the inputs were read that led to it, now if not given; the guard sends nothing decided too long ago.
+        The last gate before the wire: raises `ValueError` on a number that is not finite, `ControlLostError` when the vehicle is
+        not ours any more, `GuardLostError` when the guard is gone.
         """
-        self._require_control()
+        self.require_control()
         velocity = frame.vector_to_ned(command.velocity)
         yaw_rate = frame.yaw_rate_to_ned(command.yaw_rate_rad_s)
         if not (math.isfinite(velocity.x + velocity.y + velocity.z) and math.isfinite(yaw_rate)):
             raise ValueError(f"refusing to send a setpoint that is not finite: {command}")
-        fields = (
-            f'{{"time_boot_ms":{int(self._clock() * 1e3) & 0xFFFFFFFF},"target_system":{self._target[0]},'
-            f'"target_component":{self._target[1]},"coordinate_frame":{FRAME_LOCAL_NED},"type_mask":{TYPE_MASK_VELOCITY_YAW_RATE},'
-            f'"x":0,"y":0,"z":0,"vx":{velocity.x!r},"vy":{velocity.y!r},"vz":{velocity.z!r},'
-            f'"afx":0,"afy":0,"afz":0,"yaw":0,"yaw_rate":{yaw_rate!r}}}'
-        )
-        self.send_message("SET_POSITION_TARGET_LOCAL_NED", fields)
-        self.setpoints_sent += 1
-        return self._clock()
+        setpoint = (velocity.x, velocity.y, velocity.z, yaw_rate)
+        sent_s = self.guard.command(setpoint, self._clock() if decided_s is None else decided_s)
+        self.setpoints_sent += sent_s is not None
+        return sent_s
 
     def ask_time(self) -> None:
         """Ask the vehicle for its clock (TIMESYNC); the answer keeps `telemetry.clock` honest when the clock stood still."""
@@ -256,7 +279,7 @@ class VehicleLink:
 
     def arm(self, keep_alive: Callable[[], None] | None = None) -> None:
         """Arm, and wait until the heartbeat says so."""
-        self._require_control()
+        self.require_control()
         self._act("arm", "arm", keep_alive)
         if not self.wait_until(lambda: self.armed, 2.5, keep_alive):
             raise VehicleCommandError("the vehicle accepted arming, but its heartbeat does not say armed")
@@ -267,7 +290,7 @@ class VehicleLink:
 
     def take_off(self, height_m: float, keep_alive: Callable[[], None] | None = None) -> None:
         """Set MIS_TAKEOFF_ALT and start PX4's own takeoff; returns when PX4 accepted it, not when the height is reached."""
-        self._require_control()
+        self.require_control()
         self.set_parameter("MIS_TAKEOFF_ALT", float(height_m))
         if self.authority is not None:
             self.authority.expect(FlightMode.TAKEOFF)
@@ -285,7 +308,7 @@ class VehicleLink:
                 authority.require()
                 authority.refused()
             raise
-        self._require_control()
+        self.require_control()
 
     def _command_mode(self, mode: FlightMode, keep_alive: Callable[[], None] | None) -> None:
         self.command_long(
@@ -295,12 +318,21 @@ class VehicleLink:
             raise VehicleCommandError(f"PX4 did not enter {mode.name}: it stays in {mode_name(self.mode)}{self._last_words()}")
 
     @property
-    def in_control(self) -> bool:
-        """False once a pilot, PX4 or a restart has taken the vehicle from us."""
-        return self.authority is None or self.authority.lost is None
+    def stream_open(self) -> bool:
+        """Whether the guard still takes setpoints: not after it has fallen silent, for whatever reason."""
+        return self.guard.state in (State.FOLLOW, State.BRAKE)
 
-    def _require_control(self) -> None:
-        if self.authority is not None:
+    @property
+    def in_control(self) -> bool:
+        """False once a pilot, PX4 or a restart has taken the vehicle from us, or the guard is gone."""
+        return self.guard.lost is None and (self.authority is None or self.authority.lost is None)
+
+    def require_control(self) -> None:
+        """Raise `GuardLostError` or `ControlLostError` when nothing may be sent any more; then the guard is silent as well."""
+        if self.guard.lost is not None:
+            raise GuardLostError(self.guard.lost)
+        if self.authority is not None and self.authority.lost is not None:
+            self.close_stream()
             self.authority.require()
 
     def command_long(self, command: int, *parameters: float, what: str, keep_alive: Callable[[], None] | None = None) -> None:
@@ -395,14 +427,6 @@ def check_port_is_free(url: str) -> None:
                 f"cannot listen on {url}: {error.strerror}; stop the program that uses UDP port {port} or change the "
                 "connection in the mission"
             ) from None
-
-
-def _connection_error(url: str, result: str) -> Exception:
-    if result in ("BIND_ERROR", "SOCKET_ERROR"):
-        return RefusedError(f"cannot listen on {url}: {result}; is another program using this port?")
-    if result in ("CONNECTION_URL_INVALID", "BAUDRATE_UNKNOWN"):
-        return MissionError(f"vehicle.connection {url}: {result}; give for example udpin://127.0.0.1:14540")
-    return NoVehicleError(f"cannot open {url}: {result}; check cable, device name and permissions")
 
 
 _log_routed = False

@@ -28,6 +28,7 @@ SIM = "sim"
 Coordinate = Annotated[float, Field(ge=-10_000.0, le=10_000.0)]
 Seconds = Annotated[float, Field(gt=0.0, le=3600.0)]
 Port = Annotated[int, Field(ge=1, le=65535)]
+FaultText = Annotated[str, Field(max_length=200, pattern=r"^[a-z0-9_]+@[a-z0-9_.:+=,-]+$")]
 
 _URL = re.compile(r"(udpin|udpout|tcpin|tcpout)://[^\s:/]+:\d{1,5}$|serial(_flowcontrol)?:///[^\s:]+:\d{3,8}$")
 
@@ -128,6 +129,9 @@ class SimSection(_Section):
     wind_m_s: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     onboard_port: Port = 14540
     gcs_port: Port = 14550
+    faults: tuple[FaultText, ...] = Field(
+        default=(), max_length=100, description="what shall go wrong, such as lidar_freeze@offboard:12+3 (docs/gateway.md)"
+    )
 
     @field_validator("wind_m_s")
     @classmethod

@@ -1,8 +1,9 @@
 """OFFBOARD: the handshake, the 20 Hz loop, and every reason for which it ends.
 
-Liveness by construction: each setpoint is one message sent by this loop and by nothing else. When the loop stalls, is
-stopped or killed, the stream stops with it and PX4's own loss action (set and read back in preflight) takes over. After a
-stall the first setpoint is zero velocity, then the loop flies on with fresh samples; missed ticks are not made up for.
+Liveness by construction: each setpoint is handed to the guard (`flight.guard`) with the time at which it was decided, and goes
+out once or never. When the loop stalls, is stopped or killed, the guard brakes and falls silent, and PX4's own loss action (set
+and read back in preflight) takes over. A loop that comes back while the guard brakes sends zero velocity first, then flies on
+with fresh samples; missed ticks are not made up for. Once the guard is silent, the flight is over.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from dataclasses import dataclass, replace
 
 from flight.authority import Authority
 from flight.errors import ExitCode, VehicleCommandError
+from flight.guard.core import Reason
+from flight.health import health_of
 from flight.interrupt import Interrupt
 from flight.lidar.driver import LidarDriver
 from flight.link import VehicleLink
@@ -36,11 +39,11 @@ STILL = SafeCommand(CorridorVector(0.0, 0.0, 0.0), 0.0)
 SETPOINTS_BEFORE_OFFBOARD_S = 1.0
 STUCK_PROGRESS_M = 0.5
 LINK_LOST_S = 3.0
+MODE_REPORT_S = 0.1
 SCAN_MARGIN_S = 0.008
 ALIGNING_SCANS = 4
 MAX_STALLS = 3
 STALL_WINDOW_S = 5.0
-LOSS_CERTAINTY = 0.8
 TICKS_PER_TIME_QUESTION = 4
 SWITCH_INTERVAL_S = 1e-4
 """The longest that a telemetry callback may keep the waking loop from the interpreter."""
@@ -70,17 +73,19 @@ class OffboardFlight:
         status: Status,
         clock: Callable[[], float] = time.monotonic,
         recorder: FlightRecorder | None = None,
+        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
+        """`clock`, `sleep`: seconds of one monotonic clock; campaigns give those of simulated time."""
         self.log = FlightLog(max_ticks=int(mission.timeouts.flight_s * LOOP_RATE_HZ) + 200)
         self.log.reserve()
-        self.keeper = RateKeeper(LOOP_RATE_HZ, clock)
+        self.keeper = RateKeeper(LOOP_RATE_HZ, clock, sleep)
         self.events: list[str] = []
         self.stall_times_s: list[float] = []
         self._link, self._lidar, self._pilot, self._frame = link, lidar, pilot, frame
         self._mission, self._interrupt, self._status, self._clock = mission, interrupt, status, clock
+        self._sleep = sleep
         self._sent_s = -math.inf
-        self._engaged = False
-        self._loss_certain_s = LOSS_CERTAINTY * mission.failsafe.setpoint_loss_timeout_s
+        self._overruled = False
         self._judge = FlightJudge(mission)
         self._recorder = recorder if recorder is not None else NoRecorder()
 
@@ -91,25 +96,27 @@ class OffboardFlight:
         """
         if self._link.authority is None:
             self._link.authority = Authority(self._link.telemetry)
-        deadline = self._clock() + SETPOINTS_BEFORE_OFFBOARD_S
         self._pilot.tick(self._lidar.latest(), self._link.state(self._frame), self._clock())  # first call allocates
+        self._link.open_stream()
+        deadline = self._clock() + SETPOINTS_BEFORE_OFFBOARD_S
         while self._clock() < deadline:
             self.stay()
-            time.sleep(0.01)
+            self._sleep(0.01)
         self._pilot.reset()
         self._link.set_mode(FlightMode.OFFBOARD, keep_alive=self.stay)
-        self._engaged = True
 
     def stay(self) -> None:
         """Keep the stream alive with zero velocity, at the loop's rate however often it is called.
 
-        A stream that broke off in OFFBOARD long enough for PX4's loss action is not taken up again.
+        A stream that the guard has ended is not taken up again.
         """
-        silent_s = self._clock() - self._sent_s
-        if self._engaged and silent_s > self._loss_certain_s:
-            return
-        if silent_s >= 1.0 / LOOP_RATE_HZ:
-            self._sent_s = self._link.send_velocity(STILL, self._frame)
+        if self._link.stream_open and self._clock() - self._sent_s >= 1.0 / LOOP_RATE_HZ:
+            self._stand_still()
+
+    def _stand_still(self) -> None:
+        sent_s = self._link.send_velocity(STILL, self._frame)
+        if sent_s is not None:
+            self._sent_s = sent_s
 
     def run(self) -> Ending:
         """Fly until there is a reason to end. Raises nothing for what the vehicle or the policy does."""
@@ -121,6 +128,8 @@ class OffboardFlight:
                 while True:
                     ending = self._step()
                     if ending is not None:
+                        if not ending.in_control:
+                            self._link.close_stream()
                         return ending
         finally:
             self._status.stop_live()
@@ -139,7 +148,7 @@ class OffboardFlight:
                 due_s = min(due_s, phase_s)
         scan = self._lidar.latest()
         if scan is not None and math.isfinite(due_s):
-            time.sleep((scan.time_s + due_s - self._clock()) % (1.0 / LOOP_RATE_HZ))
+            self._sleep((scan.time_s + due_s - self._clock()) % (1.0 / LOOP_RATE_HZ))
         self.keeper.reset()
 
     def _step(self) -> Ending | None:
@@ -151,13 +160,18 @@ class OffboardFlight:
         if now_s - self._sent_s > self._mission.failsafe.stall_s:
             return self._after_stall(now_s)
         scan, state = self._lidar.latest(), self._link.state(self._frame)
-        decided = record = self._pilot.tick(scan, state, now_s)
-        if self._judge.pausing(record) and record.sent != STILL:
+        health = health_of(
+            self._link.telemetry, self._frame, self.keeper.lateness_s, self._link.authority, overruled=self._overruled
+        )
+        decided = record = self._pilot.tick(scan, state, now_s, health)
+        self._overruled = self._judge.pausing(record) and record.sent != STILL
+        if self._overruled:
             record = replace(record, sent=STILL)
-        if self._clock() - self._sent_s > self._loss_certain_s:  # held up since the tick began
+        sent_s = self._link.send_velocity(record.sent, self._frame, now_s)
+        if sent_s is None:  # held up since the tick began, or not ours any more
             self._record(decided, scan, state, None)
-            return self._after_stall(self._clock())
-        self._sent_s = self._link.send_velocity(record.sent, self._frame)
+            return self._lost_control(self._clock()) or self._after_stall(self._clock())
+        self._sent_s = sent_s
         self.log.append(record, self._sent_s, self.keeper.lateness_s)
         self.log.see(scan, state)
         self._status.publish(record, self.keeper.deadline_misses)
@@ -173,18 +187,10 @@ class OffboardFlight:
         self._recorder.tick(decided, scan, state, sent, sent_s, self._pilot.goal, keeper.lateness_s, keeper.deadline_misses)
 
     def _after_stall(self, now_s: float) -> Ending | None:
-        """The loop was held up: brake first, and look again in the next tick with samples that arrived since.
-
-        After a stall as long as PX4's loss timeout nothing is sent: PX4 has taken over, or is about to, and a single
-        setpoint would throw it back into OFFBOARD.
-        """
-        stalled_s = now_s - self._sent_s
-        self.events.append(f"loop stalled for {stalled_s:.2f} s")
-        if stalled_s > self._loss_certain_s:
-            action = self._mission.failsafe.setpoint_loss_action
-            message = f"the loop stood still for {stalled_s:.1f} s: PX4's own loss action ({action}) has the vehicle now"
-            return Ending("loop_stalled", ExitCode.SAFETY_ENDED, message, in_control=False)
-        self._sent_s = self._link.send_velocity(STILL, self._frame)
+        """The loop was held up: brake first, and look again in the next tick with samples that arrived since."""
+        self._overruled = True
+        self.events.append(f"loop stalled for {now_s - self._sent_s:.2f} s")
+        self._stand_still()
         self.stall_times_s.append(now_s)
         recent = [time_s for time_s in self.stall_times_s[-MAX_STALLS:] if now_s - time_s < STALL_WINDOW_S]
         if len(recent) < MAX_STALLS:
@@ -194,6 +200,8 @@ class OffboardFlight:
 
     def _lost_control(self, now_s: float) -> Ending | None:
         """Pilot first: a mode that fly did not command ends its control for good, whoever chose it."""
+        if (ending := self._lost_stream(now_s)) is not None:
+            return ending
         authority, telemetry = self._link.authority, self._link.telemetry
         if authority is not None and (reason := authority.lost) is not None:
             return Ending(authority.outcome, ExitCode.NOT_REACHED, reason, in_control=False)
@@ -202,13 +210,32 @@ class OffboardFlight:
             return Ending("link_lost", ExitCode.SAFETY_ENDED, message, in_control=False)  # blind: a pilot may have it
         return None
 
+    def _lost_stream(self, now_s: float) -> Ending | None:
+        """What the guard did while this loop was not looking, or that it is gone: the cause, where a mode is the effect."""
+        guard = self._link.guard
+        if guard.lost is not None:
+            return Ending("guard_lost", ExitCode.SAFETY_ENDED, guard.lost, in_control=False)
+        if guard.reason is Reason.TERMINATED:
+            return Ending("guard_stopped", ExitCode.SAFETY_ENDED, "the guard process was told to end: braking, then landing")
+        if self._link.stream_open:
+            return None
+        if guard.reason is Reason.MISSED_BEAT:
+            stalled_s, action = now_s - self._sent_s, self._mission.failsafe.setpoint_loss_action
+            message = f"the loop stood still for {stalled_s:.1f} s: the guard braked, PX4's own loss action ({action}) follows"
+            return Ending("loop_stalled", ExitCode.SAFETY_ENDED, message, in_control=False)
+        self._link.wait_until(lambda: not self._link.in_control, MODE_REPORT_S)  # the guard reads the mode before MAVSDK does
+        authority = self._link.authority
+        reason = authority.lost if authority is not None else None
+        outcome = authority.outcome if authority is not None and reason is not None else "pilot_took_over"
+        return Ending(outcome, ExitCode.NOT_REACHED, reason or "the vehicle left OFFBOARD: control given up", in_control=False)
+
     def brake(self, duration_s: float) -> None:
         """Zero velocity for `duration_s` while OFFBOARD lasts. Never raises."""
         deadline = self._clock() + duration_s
         try:
             while self._clock() < deadline and self._link.in_control and self._link.mode == FlightMode.OFFBOARD:
                 self.stay()
-                time.sleep(0.01)
+                self._sleep(0.01)
         except VehicleCommandError as error:
             self.events.append(str(error))
 
@@ -235,8 +262,11 @@ class FlightJudge:
             self._started_s = self._best_s = record.now_s
         if record.goal_reached:
             return Ending("goal_reached", ExitCode.GOAL_REACHED, f"goal reached ({record.distance_to_goal_m:.2f} m)")
+        cause = self.escalation.cause
+        if self.escalation.level == Level.YIELD:
+            message = f"safety gave up control ({cause}): the stream stops, PX4 or the pilot has the vehicle"
+            return Ending("safety", ExitCode.SAFETY_ENDED, message, in_control=False)
         if self.escalation.level >= Level.HOLD:
-            cause = self.escalation.cause
             return Ending("safety", ExitCode.SAFETY_ENDED, f"safety ended the flight ({cause}): holding, then landing")
         return self._late(record)
 

@@ -16,7 +16,7 @@ import struct
 import types
 import typing
 from collections.abc import Hashable, Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -198,9 +198,13 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(kind: type[T], value: Any) -> T:
-    """Inverse of `to_plain` for a dataclass of messages. Raises `KeyError`, `TypeError` or `ValueError`."""
+    """Inverse of `to_plain` for a dataclass of messages. Raises `KeyError`, `TypeError` or `ValueError`.
+
+    A field that has a default may be missing: an older recording does not know it.
+    """
     hints = _hints(typing.cast(Hashable, kind))
-    return kind(**{name: _read(hint, value[name]) for name, hint in hints.items()})
+    known = {name: value[name] for name in hints if name in value or name not in _defaults(typing.cast(Hashable, kind))}
+    return kind(**{name: _read(hints[name], item) for name, item in known.items()})
 
 
 def _read(hint: Any, value: Any) -> Any:
@@ -222,6 +226,12 @@ def _read(hint: Any, value: Any) -> Any:
 @cache
 def _hints(kind: Hashable) -> dict[str, Any]:
     return typing.get_type_hints(typing.cast(type, kind))
+
+
+@cache
+def _defaults(kind: Hashable) -> frozenset[str]:
+    """Fields of a message that may be missing."""
+    return frozenset(field.name for field in fields(typing.cast(Any, kind)) if field.default is not MISSING)
 
 
 def _dumps(document: dict[str, Any]) -> str:

@@ -127,7 +127,7 @@ def replayed(recording: Recording, policy: PolicyRunner) -> Iterator[tuple[TickS
         if sample.tick != number:
             return
         pilot.set_goal(sample.goal)
-        yield sample, pilot.tick(sample.scan, sample.state, sample.record.now_s)
+        yield sample, pilot.tick(sample.scan, sample.state, sample.record.now_s, sample.record.health)
 
 
 def compare(recording: Recording, tolerance: float = 0.0) -> Comparison:

@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 
 from flight.authority import Authority, ControlLostError
+from flight.conclusion import bring_down, ending_of
 from flight.errors import ExitCode, MissionError, RefusedError, VehicleCommandError
 from flight.gateway_process import GatewayProcess, GatewayReady
+from flight.guard.client import GuardLostError
 from flight.interrupt import Interrupt
 from flight.landing import Landing
 from flight.lidar import LidarDriver, body_motion, open_lidar
@@ -28,7 +30,6 @@ from flight.mission import Mission
 from flight.offboard import Ending, OffboardFlight
 from flight.preflight import (
     LOOP_RATE_HZ,
-    Check,
     Level,
     check_goal_clear,
     check_lidar,
@@ -52,6 +53,7 @@ from flight.realtime import real_time
 from flight.recording_setup import FlightRecording, flight_header, record_flight
 from flight.report import write_report
 from flight.results import FlightResult, judge_flight, true_distance_m, truth_from_report, write_log
+from flight.setpoint_loss import set_loss_action
 from flight.shadow import ShadowFlight
 from flight.status import Status
 from flight.summary import build_summary, write_json_atomic
@@ -68,7 +70,6 @@ log = logging.getLogger("flight.session")
 HEIGHT_TOLERANCE_M = 0.5
 STILL_SPEED_M_S = 0.25
 STILL_FOR_S = 1.0
-BRAKE_S = 1.0
 ARM_RETRY_S = 0.5
 TAKEOFF_ENDS_WITHIN_M = 1.0  # PX4's default NAV_MC_ALT_RAD, 0.8 m, and the error of the estimate
 
@@ -102,7 +103,8 @@ class FlightSession:
             self._start_gateway(stack)
             place = self._place()
             lidar = stack.enter_context(open_lidar(lidar_source(self._mission)))
-            link = stack.enter_context(VehicleLink(vehicle_url(self._mission)))
+            fifo = self._mission.realtime.fifo_priority
+            link = stack.enter_context(VehicleLink(vehicle_url(self._mission), guard_priority=fifo + 1 if fifo else 0))
             self._connect(link, lidar)
             self._preflight(link, lidar, policy, place)
             frame = self._anchor(link, place)
@@ -194,20 +196,9 @@ class FlightSession:
             checks += check_start(place.takeoff_point, mission.takeoff_height_m, self._ready.boxes, mission.safety)
             checks += check_goal_clear(place.goal, self._ready.boxes, mission.safety)
         if not self._shadow and all(check.level is not Level.FAIL for check in checks):
-            checks.append(self._set_loss_action(link))
+            checks.append(set_loss_action(link, mission))
         self._status.checks(checks)
         require(checks)
-
-    def _set_loss_action(self, link: VehicleLink) -> Check:
-        """PX4's reaction to a stream that stops: written, and read back from the vehicle."""
-        failsafe = self._mission.failsafe
-        seen = f"{failsafe.setpoint_loss_action} after {failsafe.setpoint_loss_timeout_s:g} s"
-        try:
-            link.set_parameter("COM_OF_LOSS_T", failsafe.setpoint_loss_timeout_s)
-            link.set_parameter("COM_OBL_RC_ACT", int(failsafe.loss_action))
-        except VehicleCommandError as error:
-            return Check("setpoint loss", Level.FAIL, str(error), "fly engages only when PX4's own failsafe is known")
-        return Check("setpoint loss", Level.PASS, seen)
 
     def _anchor(self, link: VehicleLink, place: Place) -> CorridorFrame:
         """The corridor frame through the spot where the vehicle stands."""
@@ -228,23 +219,10 @@ class FlightSession:
         link.authority = Authority(link.telemetry)
         self._arm(link)
         logging.getLogger("flight").setLevel(logging.WARNING)
-        try:
-            ending = self._take_off(link, frame) or self._engage_and_run(flight)
-        except ControlLostError as error:
-            ending = Ending(_outcome(link), ExitCode.NOT_REACHED, str(error), in_control=False)
-        except VehicleCommandError as error:
-            ending = Ending("vehicle_refused", ExitCode.NOT_REACHED, str(error))
-        except Exception as error:  # armed: whatever it is, the vehicle must come down
-            log.exception("unexpected error in flight")
-            ending = Ending("internal_error", ExitCode.SAFETY_ENDED, f"{type(error).__name__}: {error}")
+        ending = ending_of(lambda: self._take_off(link, frame) or self._engage_and_run(flight), link)
         self._status.phase(ending.message)
-        if not (ending.in_control and link.in_control):
-            self._events += flight.events
-            return ending, link.telemetry.armed is False
-        if link.mode == FlightMode.OFFBOARD:
-            flight.brake(BRAKE_S)
         landing = Landing(link, self._status, self._interrupt, self._mission.timeouts.land_s)
-        landed = landing.land(flight.stay if link.mode == FlightMode.OFFBOARD else None)
+        landed = bring_down(ending, link, flight, landing)
         self._events += [*flight.events, *landing.events]
         return ending, landed
 
@@ -259,6 +237,8 @@ class FlightSession:
                 return
             except ControlLostError as error:
                 raise RefusedError(f"not armed: {error}") from None
+            except GuardLostError as error:
+                raise RefusedError(f"{error}; look whether the vehicle is armed") from None
             except VehicleCommandError as error:
                 if link.armed:
                     return
@@ -277,8 +257,7 @@ class FlightSession:
         while time.monotonic() < deadline:
             if self._interrupt.requested:
                 return Ending("stopped", ExitCode.NOT_REACHED, f"stopped by {self._interrupt.name} during takeoff: landing")
-            if not link.in_control:
-                raise ControlLostError(link.authority.lost if link.authority is not None else None)
+            link.require_control()
             if link.mode == FlightMode.TAKEOFF:
                 climbing = True
             elif climbing and self._stopped_early(link, frame):
@@ -385,7 +364,3 @@ class FlightSession:
             write_report(folder)
         except Exception as error:  # noqa: BLE001  (a picture must not turn a good landing into an error)
             log.warning("no picture or report: %s: %s; try `fly report %s`", type(error).__name__, error, folder)
-
-
-def _outcome(link: VehicleLink) -> str:
-    return link.authority.outcome if link.authority is not None else "pilot_took_over"

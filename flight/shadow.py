@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from flight.errors import ExitCode
+from flight.health import health_of
 from flight.interrupt import Interrupt
 from flight.lidar.driver import LidarDriver
 from flight.mission import Mission
@@ -117,7 +118,8 @@ class ShadowFlight:
         if now_s - started_s > self._mission.timeouts.flight_s:
             return _ended("timeout", f"{self._mission.timeouts.flight_s:g} s logged: the pilot flies on, nothing was sent")
         scan, state = self._lidar.latest(), self._vehicle.state(self._frame)
-        record = self._pilot.tick(scan, state, now_s)
+        health = health_of(telemetry, self._frame, self.keeper.lateness_s)
+        record = self._pilot.tick(scan, state, now_s, health)
         self.log.append(record, math.nan)
         self.log.see(scan, state)
         self._status.publish(record, self.keeper.deadline_misses)

@@ -13,6 +13,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from flight.px4 import AUTOPILOT_COMPONENT, GRAVITY_M_S2, MODE_FLAG_ARMED, mode_of
+from flight.self_report import Echo, SelfReport
 from safety.frames import CorridorFrame, NedVector
 from safety.messages import VehicleState
 
@@ -145,6 +146,7 @@ class Telemetry:
         self.mode_log: tuple[int, tuple[tuple[float, int], ...]] = (0, ())
         self.landed_state: int | None = None
         self.battery_fraction: float | None = None
+        self.report = SelfReport()
         self.texts: deque[StatusText] = deque(maxlen=MAX_TEXTS)
         self.dropped = 0
         self.counts: dict[str, int] = {}
@@ -176,6 +178,7 @@ class Telemetry:
             pitch_rad=attitude.pitch_rad,
             yaw_rad=frame.yaw_to_corridor(attitude.yaw_rad),
             yaw_rate_rad_s=frame.yaw_rate_to_ned(attitude.yaw_rate_rad_s),
+            reset_counter=self.report.reset_counter,
         )
 
     def _sample_time(self, kind: str, boot_s: float, arrival_s: float) -> float:
@@ -210,6 +213,20 @@ class Telemetry:
         boot_s, asked_s = _number(fields, "tc1") * 1e-9, _number(fields, "ts1") * 1e-9
         if boot_s > 0.0 and 0.0 <= arrival_s - asked_s <= MAX_ROUND_TRIP_S:
             self.clock.bound(boot_s, asked_s)
+            self.report.round_trip_s = arrival_s - asked_s
+
+    def _on_odometry(self, fields: dict[str, object], _arrival_s: float) -> None:
+        self.report.reset_counter = int(_number(fields, "reset_counter"))
+
+    def _on_estimator(self, fields: dict[str, object], _arrival_s: float) -> None:
+        self.report.set_estimator(int(_number(fields, "flags")), _number(fields, "pos_horiz_accuracy"))
+
+    def _on_target(self, fields: dict[str, object], arrival_s: float) -> None:
+        if fields["vx"] is None:  # JSON has no NaN: no velocity is set
+            self.report.echo = None
+            return
+        time_s = self._sample_time("target", _number(fields, "time_boot_ms") * 1e-3, arrival_s)
+        self.report.echo = Echo(time_s, _vector(fields, "vx", "vy", "vz"))
 
     def _on_heartbeat(self, fields: dict[str, object], arrival_s: float) -> None:
         self.autopilot = int(_number(fields, "autopilot"))
@@ -244,6 +261,9 @@ _HANDLERS = {
     "ATTITUDE": Telemetry._on_attitude,
     "HIGHRES_IMU": Telemetry._on_imu,
     "TIMESYNC": Telemetry._on_timesync,
+    "ODOMETRY": Telemetry._on_odometry,
+    "ESTIMATOR_STATUS": Telemetry._on_estimator,
+    "POSITION_TARGET_LOCAL_NED": Telemetry._on_target,
     "HEARTBEAT": Telemetry._on_heartbeat,
     "CURRENT_MODE": Telemetry._on_current_mode,
     "EXTENDED_SYS_STATE": Telemetry._on_landed,

@@ -6,6 +6,7 @@ states and times give the same records, bit for bit (apart from `inference_s`, w
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from policy_export.runner import PolicyRunner
 from safety.filter import SafetyFilter
 from safety.frames import CorridorVector, HeadingVector, heading_to_corridor
 from safety.lidar import scan_problem
-from safety.messages import LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
+from safety.messages import Health, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +32,7 @@ class TickRecord:
     `scan_time_s`, `state_time_s`: when the samples used were measured, NaN without one. `wanted`: the policy's command,
     None where the policy was not asked or not believed. `sent`: what the safety filter lets out. `hidden_reset`: the
     recurrent state was zero before or after this tick's step. `inference_s`: NaN where the policy was not stepped.
+    `health`: what the filter was told besides, None where the loop told nothing.
     """
 
     now_s: float
@@ -47,6 +49,7 @@ class TickRecord:
     inference_s: float
     hidden_norm: float
     hidden_reset: bool
+    health: Health | None = None
 
 
 class Pilot:
@@ -93,12 +96,19 @@ class Pilot:
             self.goal = goal
             self._policy.reset("goal_change")
 
-    def tick(self, scan: LidarScan | None, state: VehicleState | None, now_s: float) -> TickRecord:
-        """One step of the whole stack at `now_s`. Never raises for bad samples: they end in a braking command."""
+    def tick(self, scan: LidarScan | None, state: VehicleState | None, now_s: float, health: Health | None = None) -> TickRecord:
+        """One step of the whole stack at `now_s`. Never raises for bad samples: they end in a braking command.
+
+        `health`: what the loop knows besides. Where it lacks the inference time, that of this tick is judged; without any
+        `health` no time is judged, because lockstep measures the computer, not the flight.
+        """
         known = state if _usable(state) else None
         observation = self._observe(scan, known, now_s)
         wanted, inference_s, hidden_reset = self._decide(observation, known, now_s)
-        sent, verdict = self._safety.apply(wanted, state, scan, now_s)
+        judged = self._complete(health, inference_s)
+        sent, verdict = self._safety.apply(wanted, state, scan, now_s, judged)
+        if verdict.fault == "hidden_exploded":
+            self._policy.reset("bad_output")
         distance_m = _distance_m(known.position, self.goal) if known is not None else math.nan
         return TickRecord(
             now_s=now_s,
@@ -113,9 +123,17 @@ class Pilot:
             distance_to_goal_m=distance_m,
             goal_reached=distance_m <= self.goal_radius_m,
             inference_s=inference_s,
-            hidden_norm=self._policy.hidden_norm,
+            hidden_norm=judged.hidden_norm,
             hidden_reset=hidden_reset,
+            health=None if health is None else judged,
         )
+
+    def _complete(self, health: Health | None, inference_s: float) -> Health:
+        """What the loop knows, and what is known here."""
+        if health is None:
+            return Health(hidden_norm=self._policy.hidden_norm)
+        measured = health.inference_s if math.isfinite(health.inference_s) else inference_s
+        return dataclasses.replace(health, hidden_norm=self._policy.hidden_norm, inference_s=measured)
 
     def _observe(self, scan: LidarScan | None, state: VehicleState | None, now_s: float) -> NDArray[np.float32] | None:
         """The policy's observation, or None when a sample is missing, stale or says nothing."""

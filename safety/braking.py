@@ -21,6 +21,7 @@ from safety.messages import VehicleState
 
 Floats = NDArray[np.float64]
 HISTORY = 64
+ZERO = CorridorVector(0.0, 0.0, 0.0)
 _Triple = tuple[float, float, float]
 
 
@@ -37,6 +38,25 @@ class CommandHistory:
     def add(self, time_s: float, velocity: CorridorVector) -> None:
         """Remember a velocity command sent at a time."""
         self._sent.append((time_s, velocity))
+
+    def overrule(self) -> None:
+        """Zero velocity was sent instead of the newest command."""
+        if self._sent:
+            self._sent[-1] = (self._sent[-1][0], ZERO)
+
+    def newest(self) -> CorridorVector:
+        """The velocity command sent last; zero before the first."""
+        return self._sent[-1][1] if self._sent else ZERO
+
+    def sent(self, begin_s: float, end_s: float) -> list[CorridorVector]:
+        """The commands that were the newest one at some time of [begin_s, end_s]."""
+        result: list[CorridorVector] = []
+        for time_s, velocity in reversed(self._sent):
+            if time_s <= end_s:
+                result.append(velocity)
+            if time_s <= begin_s:
+                break
+        return result
 
     def phases(self, begin_s: float, end_s: float, before: CorridorVector) -> list[tuple[float, CorridorVector]]:
         """Durations and commands that cover [begin_s, end_s]; `before` is taken for times older than the history."""
@@ -93,6 +113,15 @@ def _flown(state: VehicleState, phases: list[tuple[float, CorridorVector]], lag_
         pz += command.z * duration_s + dz * gone
         vx, vy, vz = command.x + dx * left, command.y + dy * left, command.z + dz * left
     return (px, py, pz), (vx, vy, vz)
+
+
+def flown_velocity(velocity: CorridorVector, phases: list[tuple[float, CorridorVector]], lag_s: float) -> _Triple:
+    """Velocity after the phases, as in `predict_start`, m/s."""
+    x, y, z = velocity.x, velocity.y, velocity.z
+    for duration_s, command in phases:
+        left = math.exp(-duration_s / lag_s)
+        x, y, z = command.x + (x - command.x) * left, command.y + (y - command.y) * left, command.z + (z - command.z) * left
+    return x, y, z
 
 
 @lru_cache(maxsize=16)

@@ -11,6 +11,8 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from safety.monitor_config import MonitorConfig
+
 Positive = Annotated[float, Field(gt=0.0, le=1000.0)]
 NotNegative = Annotated[float, Field(ge=0.0, le=1000.0)]
 Corner = tuple[float, float, float]
@@ -71,6 +73,7 @@ class SafetyConfig(_Frozen):
     memory_s: NotNegative = Field(20.0, description="returns that left the field of view are remembered this long")
     memory_hold_s: NotNegative = Field(0.12, description="a return is kept this long although newer scans look past it")
     ground_z_m: float = Field(0.0, description="corridor z of the ground; returns this low are the ground, not obstacles")
+    monitors: MonitorConfig = Field(MonitorConfig.model_validate({}), description="thresholds of the monitors")
     ground_band_m: NotNegative = Field(0.2, description="height above the ground up to which a tilted beam's return is ground")
 
     @property

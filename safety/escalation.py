@@ -1,9 +1,10 @@
-"""What follows a fault: FLY -> BRAKE -> HOLD -> LAND, as data. The loop asks once per tick and does what `level` says.
+"""What follows a fault: FLY -> BRAKE -> HOLD -> LAND -> YIELD, as data. The loop asks once per tick and does what `level` says.
 
-* A fault (`Verdict.fault`) makes BRAKE at once. A fault that lasts `hold_after_s` makes HOLD; HOLD that lasts `land_after_s`
-  with the fault still there makes LAND. A fault that leaves no usable estimate makes LAND instead of HOLD, which needs one.
+* A fault (`Verdict.fault`) makes BRAKE at once, or the level that `safety.reactions` gives it. A fault that lasts
+  `hold_after_s` makes HOLD; HOLD that lasts `land_after_s` with the fault still there makes LAND.
+  A fault that leaves no usable estimate makes LAND instead of HOLD, which needs one.
 * BRAKE ends by itself only after `healthy_s` without any fault: that is a pause, not a decision. HOLD and LAND never end by
-  themselves: only `re_engage`, an operator's act, leaves them.
+  themselves: only `re_engage`, an operator's act, leaves them. YIELD ends never: the vehicle is somebody else's.
 * Braking for an obstacle or the fence is no fault; only when it lasts `blocked_hold_s` without a break does it make HOLD.
 """
 
@@ -11,23 +12,26 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from enum import IntEnum
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from safety.config import Positive
 from safety.messages import Verdict
+from safety.reactions import Level, level_of
 
-ESTIMATE_FAULTS = frozenset({"state_missing", "state_stale", "state_not_finite", "state_future", "state_backwards"})
+__all__ = ["ESTIMATE_FAULTS", "EscalationConfig", "EscalationState", "Level", "escalate", "re_engage"]
 
-
-class Level(IntEnum):
-    """How severe the reaction is; larger is more severe."""
-
-    FLY = 0
-    BRAKE = 1
-    HOLD = 2
-    LAND = 3
+ESTIMATE_FAULTS = frozenset(
+    {
+        "state_missing",
+        "state_stale",
+        "state_not_finite",
+        "state_future",
+        "state_backwards",
+        "estimate_frozen",
+        "velocity_mismatch",
+    }
+)
 
 
 class EscalationConfig(BaseModel):
@@ -64,7 +68,9 @@ def escalate(state: EscalationState, verdict: Verdict, now_s: float, config: Esc
 
 
 def re_engage(state: EscalationState, now_s: float, config: EscalationConfig) -> EscalationState:
-    """An operator's decision to fly on: FLY when no fault was seen for `healthy_s`, else the state as it is."""
+    """An operator's decision to fly on: FLY when no fault was seen for `healthy_s`, else the state as it is. YIELD is final."""
+    if state.level == Level.YIELD:
+        return state
     if state.fault_last_s is not None and now_s - state.fault_last_s < config.healthy_s:
         return state
     return EscalationState(Level.FLY, now_s)
@@ -83,14 +89,14 @@ def _note(state: EscalationState, verdict: Verdict, now_s: float) -> EscalationS
 
 def _wanted(noted: EscalationState, verdict: Verdict, now_s: float, config: EscalationConfig) -> Level:
     """The level that this tick alone asks for."""
-    if noted.fault_since_s is not None:
-        lasted = now_s - noted.fault_since_s
+    if verdict.fault is not None and noted.fault_since_s is not None:
+        at_once, lasted = level_of(verdict.fault), now_s - noted.fault_since_s
         on_hold = noted.level == Level.HOLD and noted.level_since_s is not None
         if on_hold and now_s - (noted.level_since_s or 0.0) >= config.land_after_s:
-            return Level.LAND
+            return max(at_once, Level.LAND)
         if lasted < config.hold_after_s:
-            return Level.BRAKE
-        return Level.LAND if verdict.fault in ESTIMATE_FAULTS else Level.HOLD
+            return at_once
+        return max(at_once, Level.LAND if verdict.fault in ESTIMATE_FAULTS else Level.HOLD)
     if noted.blocked_since_s is not None and now_s - noted.blocked_since_s >= config.blocked_hold_s:
         return Level.HOLD
     return Level.FLY

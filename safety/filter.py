@@ -10,13 +10,14 @@ import dataclasses
 import math
 
 from safety.braking import CommandHistory, predict_start
+from safety.caps import cap_speed
 from safety.config import SafetyConfig
 from safety.frames import CorridorVector
 from safety.lidar import BeamTable, SeenScan, see
 from safety.limits import limit_command
 from safety.memory import ObstacleMemory
-from safety.messages import BRAKE, Intervention, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
-from safety.monitors import InputMonitor
+from safety.messages import BRAKE, Health, Intervention, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
+from safety.monitors import REANCHORING, InputMonitor, Judgement
 from safety.shield import Decision, Shield, Surroundings
 
 MAX_GAP_TICKS = 2.0  # a longer gap between calls allows no larger step of the command
@@ -52,41 +53,64 @@ class SafetyFilter:
         self.last_error = None
 
     def apply(
-        self, command: VelocityCommand | None, state: VehicleState | None, scan: LidarScan | None, now_s: float
+        self,
+        command: VelocityCommand | None,
+        state: VehicleState | None,
+        scan: LidarScan | None,
+        now_s: float,
+        health: Health | None = None,
     ) -> tuple[SafeCommand, Verdict]:
         """The command to send now, and why.
 
         `command`: wanted, corridor frame; `state`, `scan`: the newest ones, stamped on the clock of `now_s`; None = none came.
+        `health`: what the loop knows besides; None = nothing.
         Never raises: whatever goes wrong is a BRAKE whose `Verdict.fault` names the rule (`last_error`: an exception's text).
         """
         try:
-            sent, verdict = self._apply(command, state, scan, now_s)
+            sent, verdict = self._apply(command, state, scan, now_s, health)
         except Exception as error:  # noqa: BLE001  fails closed: an unforeseen error must brake, not end the control loop
             self.last_error = f"{type(error).__name__}: {error}"
-            sent, verdict = _braked("internal_error", math.nan, math.nan)
+            sent, verdict = _braked(Intervention("internal_error", math.nan, math.nan))
         self._remember(sent, now_s)
         return sent, verdict
 
     def _apply(
-        self, command: VelocityCommand | None, state: VehicleState | None, scan: LidarScan | None, now_s: float
+        self,
+        command: VelocityCommand | None,
+        state: VehicleState | None,
+        scan: LidarScan | None,
+        now_s: float,
+        health: Health | None,
     ) -> tuple[SafeCommand, Verdict]:
-        fault = self._monitor.judge(command, state, scan, now_s)
-        if fault is not None or command is None or state is None or scan is None:
-            sent, verdict = _braked("input_missing", math.nan, math.nan) if fault is None else _braked(*_fields(fault))
+        if health is not None and health.overruled:
+            self._history.overrule()
+            self._last = BRAKE.velocity
+        judged = self._monitor.judge(command, state, scan, now_s, self._history, health)
+        if any(fault.rule in REANCHORING for fault in judged.faults):
+            self._memory.clear()
+            self._seen = None
+        if judged.faults or command is None or state is None or judged.scan is None:
+            sent, verdict = _braked(*(judged.faults or (Intervention("input_missing", math.nan, math.nan),)))
         else:
-            sent, verdict = self._steer(command, state, scan, now_s)
-        return sent, dataclasses.replace(verdict, scan_age_s=_age(scan, now_s), state_age_s=_age(state, now_s))
+            sent, verdict = self._steer(command, state, judged.scan, now_s, judged)
+        told = verdict.interventions + judged.notices
+        return sent, dataclasses.replace(
+            verdict, interventions=told, scan_age_s=_age(scan, now_s), state_age_s=_age(state, now_s)
+        )
 
-    def _steer(self, command: VelocityCommand, state: VehicleState, scan: LidarScan, now_s: float) -> tuple[SafeCommand, Verdict]:
-        """All inputs are fit: limits, then the shield, then the gate."""
-        limited, limits = limit_command(command, self._last, self._dt_s(now_s), scan.range_max_m, self.config)
+    def _steer(
+        self, command: VelocityCommand, state: VehicleState, scan: LidarScan, now_s: float, judged: Judgement
+    ) -> tuple[SafeCommand, Verdict]:
+        """All inputs are fit: caps and limits, then the shield, then the gate."""
+        capped, caps = cap_speed(command, judged.cap, self.config)
+        limited, limits = limit_command(capped, self._last, self._dt_s(now_s), scan.range_max_m, self.config)
         around = self._look(state, scan, now_s)
         decision = self._shield.choose(limited.velocity, around)
         sent = SafeCommand(decision.velocity, limited.yaw_rate_rad_s)
         problem = gate_problem(sent, self.config)
         if problem is not None:
-            return _braked(*_fields(problem))
-        return sent, _verdict(limited, sent, limits, decision)
+            return _braked(problem)
+        return sent, _verdict(limited, sent, caps + limits, decision)
 
     def _look(self, state: VehicleState, scan: LidarScan, now_s: float) -> Surroundings:
         """Take in a scan once, and gather what the shield needs at this tick."""
@@ -136,14 +160,10 @@ def _verdict(wanted: VelocityCommand, sent: SafeCommand, limits: tuple[Intervent
     )
 
 
-def _braked(rule: str, value: float, limit: float) -> tuple[SafeCommand, Verdict]:
-    """BRAKE for a fault."""
-    verdict = Verdict(braking=True, interventions=(Intervention(rule, value, limit),), fault=rule)
+def _braked(*faults: Intervention) -> tuple[SafeCommand, Verdict]:
+    """BRAKE for faults, the most severe first."""
+    verdict = Verdict(braking=True, interventions=faults, fault=faults[0].rule)
     return SafeCommand(BRAKE.velocity, BRAKE.yaw_rate_rad_s), verdict
-
-
-def _fields(found: Intervention) -> tuple[str, float, float]:
-    return found.rule, found.value, found.limit
 
 
 def _age(sample: VehicleState | LidarScan | None, now_s: float) -> float:

@@ -35,6 +35,7 @@ class VehicleState:
     """Estimated motion in the corridor frame. `yaw_rad` is counter-clockwise from the corridor's x axis.
 
     `roll_rad` positive right side down, `pitch_rad` positive nose up (aerospace signs, as PX4 reports them).
+    `reset_counter`: how often the estimator has set its state anew, modulo 256; None = not told.
     """
 
     time_s: float
@@ -45,6 +46,7 @@ class VehicleState:
     pitch_rad: float
     yaw_rad: float
     yaw_rate_rad_s: float
+    reset_counter: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +58,33 @@ class VelocityCommand:
 
 
 BRAKE = VelocityCommand(CorridorVector(0.0, 0.0, 0.0), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """What only the loop knows about a tick. NaN and None = unknown, which accuses nobody.
+
+    `lateness_s`: how late the tick began. `link_delay_s`: newest measured round trip to the autopilot. `battery_fraction`: 0..1.
+    `in_control`: False once a pilot, PX4 or a restart took the vehicle. `landed`: what the autopilot says. `boots`: restarts of
+    the autopilot seen so far. `estimate_valid`: its estimator's own flags; `accuracy_m`: its own horizontal accuracy, one sigma.
+    `echo`: the velocity setpoint that the autopilot says it follows, corridor frame; `echo_time_s`: when it said so.
+    `inference_s`: time the policy took for this tick's command; `hidden_norm`: of its recurrent state.
+    `overruled`: the loop sent zero velocity instead of what the filter let out last.
+    """
+
+    lateness_s: float = float("nan")
+    link_delay_s: float = float("nan")
+    battery_fraction: float = float("nan")
+    in_control: bool | None = None
+    landed: bool | None = None
+    boots: int | None = None
+    estimate_valid: bool | None = None
+    accuracy_m: float = float("nan")
+    echo: CorridorVector | None = None
+    echo_time_s: float = float("nan")
+    inference_s: float = float("nan")
+    hidden_norm: float = float("nan")
+    overruled: bool = False
 
 
 @dataclass(frozen=True, slots=True)

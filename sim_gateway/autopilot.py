@@ -11,8 +11,10 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
+from sim_gateway.battery import Battery, Charge
 from sim_gateway.flight_modes import AUTO_MAIN_MODE, FlightMode, LandedState, Result, SystemStatus
 from sim_gateway.flight_tasks import (
+    DescendTask,
     FlightTask,
     HoldTask,
     LandTask,
@@ -43,6 +45,13 @@ _OBL_STOP_MOTORS = (6, 7)
 _OVERRIDE_AUTO, _OVERRIDE_OFFBOARD = 1, 2  # bits of COM_RC_OVERRIDE
 _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 2, 4  # bits of COM_RCL_EXCEPT
 _STICKS_DISABLED, _RADIO_ONLY = 4, 0  # COM_RC_IN_MODE values that ignore MANUAL_CONTROL
+_GPS_GIVEN_UP_S = 5.1  # recorded 5.1 and 5.2 s
+_BATTERY_TEXTS = {
+    Charge.LOW: (CRITICAL, "Low battery"),
+    Charge.CRITICAL: (CRITICAL, "Critical battery level"),
+    Charge.EMERGENCY: (0, "Emergency battery level"),
+}
+_LOW_BATTERY_ACTIONS = {2: FlightMode.LAND, 3: FlightMode.RTL}  # COM_LOW_BAT_ACT
 _RCL_ACTIONS = {2: FlightMode.RTL, 3: FlightMode.LAND}  # NAV_RCL_ACT; 1 stays in Hold
 
 
@@ -89,19 +98,27 @@ class Autopilot:
         altitude_amsl_m: float = DEFAULT_ALTITUDE_M,
     ) -> None:
         self.parameters = parameters or ParameterStore()
+        self.state = NedState(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, True)
+        self.texts: deque[StatusText] = deque(maxlen=_KEPT_TEXTS)
+        self.mode_changes: deque[ModeChange] = deque(maxlen=_KEPT_TEXTS)
+        self.battery = Battery()
+        self.gps_fix = True
+        self.refuses_offboard = False
+        self._start_up_s = ready_after_s
+        self._altitude_amsl_m = altitude_amsl_m
+        self._forget(0.0)
+
+    def _forget(self, now_s: float) -> None:
+        """The state after power came on at `now_s`."""
         self.mode = FlightMode.LOITER
         self.intended = FlightMode.LOITER
         self.armed = False
         self.failsafe = False
         self.landed = True
         self.home: Vector = (0.0, 0.0, 0.0)
-        self.state = NedState(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, True)
         self.target = OffboardSetpoint()
         self.output = MOTORS_OFF
-        self.texts: deque[StatusText] = deque(maxlen=_KEPT_TEXTS)
-        self.mode_changes: deque[ModeChange] = deque(maxlen=_KEPT_TEXTS)
-        self._ready_after_s = ready_after_s
-        self._altitude_amsl_m = altitude_amsl_m
+        self._ready_after_s = now_s + self._start_up_s
         self._setpoint = OffboardSetpoint(velocity=(0.0, 0.0, 0.0))
         self._setpoint_time_s, self._setpoint_fresh = -math.inf, False
         self._after_disarming = FlightMode.LOITER
@@ -117,6 +134,9 @@ class Autopilot:
         self._last_step_s: float | None = None
         self.sticks = Sticks()
         self._pilot_lost_s: float | None = None
+        self._gps_lost_s: float | None = None
+        self._low_since_s: float | None = None
+        self._latched = False  # in a failsafe that a setpoint stream does not end
 
     # ---- what telemetry reports
 
@@ -145,6 +165,11 @@ class Autopilot:
     def has_pilot(self) -> bool:
         """Whether stick input came within COM_RC_LOSS_T."""
         return self.now_s - self.sticks.time_s < self.parameters.get("COM_RC_LOSS_T")
+
+    @property
+    def position_given_up(self) -> bool:
+        """Whether GPS has been away for so long that the position estimate is no longer used."""
+        return self._gps_lost_s is not None and self.now_s - self._gps_lost_s >= _GPS_GIVEN_UP_S
 
     @property
     def system_status(self) -> SystemStatus:
@@ -253,6 +278,19 @@ class Autopilot:
         self._task_yaw_rad = yaw_rad
         return Result.ACCEPTED
 
+    def fail_into(self, mode: FlightMode, text: str = "Failsafe activated") -> None:
+        """A failsafe of PX4's own takes the vehicle over; only a mode command ends it."""
+        self.failsafe = self._latched = True
+        self._task_target = self._task_yaw_rad = None
+        self.say(CRITICAL, text)
+        self._enter(mode)
+
+    def restart(self) -> None:
+        """Power lost and back: motors off, everything but the parameters forgotten."""
+        self._forget(self.now_s)
+        self.landed = self.state.on_ground
+        self._record()
+
     def say(self, severity: int, text: str) -> None:
         """Queue a STATUSTEXT."""
         self.texts.append(StatusText(self.now_s, severity, text))
@@ -270,6 +308,8 @@ class Autopilot:
             self.landed = self.landed or state.on_ground
             return self.output
         self._check_pilot_loss()
+        self._check_gps()
+        self._check_battery()
         self._check_offboard_loss()
         if not self.armed:
             return self.output
@@ -297,14 +337,14 @@ class Autopilot:
 
     def _can_fly(self, mode: FlightMode) -> bool:
         if mode is FlightMode.OFFBOARD:
-            return self.stream_alive
+            return self.stream_alive and not self.refuses_offboard
         return self.has_pilot if mode.needs_pilot else mode is not FlightMode.MISSION
 
     def _intend(self, mode: FlightMode) -> None:
         self.intended = mode
         if mode not in (FlightMode.LAND, FlightMode.RTL):
             self._after_disarming = mode
-        self.failsafe, self._pilot_lost_s = False, None
+        self.failsafe, self._pilot_lost_s, self._latched = False, None, False
         self._enter(mode)
 
     def _enter(self, mode: FlightMode) -> None:
@@ -320,7 +360,8 @@ class Autopilot:
         if self.mode is FlightMode.OFFBOARD:
             return OffboardTask(parameters, self._setpoint)
         if self.mode.needs_pilot:
-            return PositionTask(parameters, state, self.sticks)
+            blind = self.mode is FlightMode.ALTCTL and self._latched
+            return DescendTask(parameters, state) if blind else PositionTask(parameters, state, self.sticks)
         if self.mode is FlightMode.TAKEOFF:
             return TakeoffTask(parameters, state, self._takeoff_target_down_m())
         if self.mode is FlightMode.LAND:
@@ -347,7 +388,7 @@ class Autopilot:
 
     def _check_offboard_loss(self) -> None:
         """The failsafe of OFFBOARD: acts when the stream is lost, gives the vehicle back when it resumes."""
-        if self.intended is not FlightMode.OFFBOARD or self._pilot_lost_s is not None:
+        if self.intended is not FlightMode.OFFBOARD or self._pilot_lost_s is not None or self._latched:
             return
         if self.failsafe and self.stream_alive:
             self.failsafe = False
@@ -361,6 +402,30 @@ class Autopilot:
             self._enter(_OBL_ACTIONS.get(action, fallback))
             if action in _OBL_STOP_MOTORS:
                 self._disarm("failsafe")
+
+    def _check_gps(self) -> None:
+        """Without GPS the position estimate is given up after a while: a level descent that HEARTBEAT shows as ALTCTL."""
+        if self.gps_fix:
+            self._gps_lost_s = None
+        elif self._gps_lost_s is None:
+            self._gps_lost_s = self.now_s
+        elif self.now_s - self._gps_lost_s >= _GPS_GIVEN_UP_S and not self._latched:
+            self.fail_into(FlightMode.ALTCTL)
+
+    def _check_battery(self) -> None:
+        """Warnings as the charge falls; at critical, where COM_LOW_BAT_ACT says so, Hold for COM_FAIL_ACT_T, then its action."""
+        state, action = self.battery.judge(self.parameters), int(self.parameters.get("COM_LOW_BAT_ACT"))
+        if state > self.battery.charge_state:
+            self.battery.charge_state = state
+            self.say(*_BATTERY_TEXTS[state])
+        if state < Charge.CRITICAL or action not in _LOW_BATTERY_ACTIONS:
+            return
+        if self._low_since_s is None:
+            self._low_since_s = self.now_s
+            seconds = self.parameters.get("COM_FAIL_ACT_T")
+            self.fail_into(FlightMode.LOITER, f"Failsafe activated: entering Hold for {seconds:.0f} seconds")
+        elif self.now_s - self._low_since_s >= self.parameters.get("COM_FAIL_ACT_T") and self.mode is FlightMode.LOITER:
+            self.fail_into(FlightMode.LAND if state is Charge.EMERGENCY else _LOW_BATTERY_ACTIONS[action])
 
     def _check_pilot_loss(self) -> None:
         """The failsafe of a pilot who was there and is gone: Hold at once, NAV_RCL_ACT after COM_FAIL_ACT_T."""

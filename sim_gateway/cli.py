@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from sim_gateway.faults import Fault
     from sim_gateway.gateway import GatewayConfig
     from sim_gateway.scene import World
 
@@ -28,6 +29,8 @@ sim-gateway --world configs/worlds/corridor.yaml
 sim-gateway --world configs/worlds/corridor.yaml --seed 7 --wind 1,0.5,0 --report runs/truth.json
 
 sim-gateway --world configs/worlds/paper.yaml --onboard-port 14541 --lidar-port 10941 --gcs-port 0
+
+sim-gateway --world configs/worlds/corridor.yaml --fault lidar_freeze@offboard:12+3 --fault battery@40:fraction=0.1
 
 sim-gateway --world configs/worlds/corridor.yaml --serial-lidar ld06 --serial-link /tmp/lidar
 
@@ -79,6 +82,11 @@ def serve(
     lidar_port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the LiDAR; 0: any free one.")] = 10940,
     serial_lidar: Annotated[SerialKind | None, typer.Option(help="Also a spinning LiDAR on a pseudo-terminal.")] = None,
     serial_link: Annotated[Path | None, typer.Option(help="Symbolic link to that pseudo-terminal.")] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND@START+DURATION", help="A fault, such as lidar_freeze@12+3; repeatable. See docs/gateway.md."),
+    ] = None,
+    faults: Annotated[Path | None, typer.Option(help="Scenario file (YAML) of faults.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write the true path, contacts and events here (JSON).")] = None,
     speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Vehicle seconds per second.")] = 1.0,
     max_time: Annotated[float, typer.Option(min=0.0, help="Stop after this many vehicle seconds; 0: never.")] = 0.0,
@@ -108,6 +116,7 @@ def serve(
         report=report,
         serial_lidar=serial_lidar.value if serial_lidar is not None else None,
         serial_link=serial_link,
+        faults=_faults(fault or [], faults),
     )
     _serve(scene, config, quit_with_parent)
 
@@ -190,6 +199,15 @@ def _load(path: Path, seed: int | None, start: str | None, goal: str | None) -> 
         if clearance_m(world.boxes_at(0.0), np.array(point), 0.0) <= 0.0:
             raise _UsageError(f"--{name} {point} lies inside an obstacle: choose another place")
     return world
+
+
+def _faults(texts: list[str], file: Path | None) -> tuple[Fault, ...]:
+    from sim_gateway.faults import Fault, FaultError, load_faults
+
+    try:
+        return (*(load_faults(file) if file is not None else ()), *(Fault.parse(text) for text in texts))
+    except FaultError as error:
+        raise _UsageError(str(error)) from None
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:

@@ -10,12 +10,19 @@ from typing import Protocol
 from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.autopilot import FORCE_MAGIC, Autopilot
+from sim_gateway.faults import Fault, FaultSchedule
 from sim_gateway.flight_modes import AUTO_MAIN_MODE, Result
 from sim_gateway.local_frame import LocalFrame, Vector
 from sim_gateway.telemetry import Message, Telemetry
 
 _COMMAND_LONG_VERSION_REQUEST = 520  # MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, deprecated but answered
 _CUSTOM_MODE_FLAG = 1
+# MAV_CMD_INJECT_FAILURE: unit to faults. PX4's simplest simulator takes the motor and shows no effect.
+_FAILURES: dict[int, tuple[tuple[str, dict[str, float]], ...]] = {
+    mav.FAILURE_UNIT_SENSOR_GPS: (("gps_loss", {}),),
+    mav.FAILURE_UNIT_SYSTEM_BATTERY: (("battery", {"fraction": 0.04}),),
+    mav.FAILURE_UNIT_SYSTEM_MOTOR: (),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +73,8 @@ class CommandHandler:
         self._autopilot = autopilot
         self._telemetry = telemetry
         self._frame = frame
-        self._handlers: dict[int, Callable[[Command, Link], Result]] = {
+        self.schedule: FaultSchedule | None = None
+        self._handlers: dict[int, Callable[[Command, Link], Result | None]] = {
             mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
             mav.MAV_CMD_NAV_TAKEOFF: lambda command, _: autopilot.takeoff(command.altitude_m),
             mav.MAV_CMD_NAV_LAND: lambda _, __: autopilot.land(),
@@ -76,6 +84,7 @@ class CommandHandler:
             mav.MAV_CMD_DO_CHANGE_SPEED: self._change_speed,
             mav.MAV_CMD_DO_SET_HOME: self._set_home,
             mav.MAV_CMD_DO_FLIGHTTERMINATION: self._terminate,
+            mav.MAV_CMD_INJECT_FAILURE: self._inject_failure,
             mav.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
             mav.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
             mav.MAV_CMD_REQUEST_MESSAGE: self._request_message,
@@ -90,7 +99,9 @@ class CommandHandler:
             return
         if command.number == mav.MAV_CMD_DO_SET_MODE:
             acknowledge(Result.ACCEPTED)
-        acknowledge(handler(command, link))
+        result = handler(command, link)
+        if result is not None:
+            acknowledge(result)
 
     def _arm_disarm(self, command: Command, _: Link) -> Result:
         force = whole(command.p2) == FORCE_MAGIC
@@ -132,6 +143,21 @@ class CommandHandler:
 
     def _terminate(self, command: Command, _: Link) -> Result:
         return self._autopilot.disarm(force=True) if command.p1 > 0.5 else Result.DENIED
+
+    def _inject_failure(self, command: Command, _: Link) -> Result | None:
+        """Units that this vehicle can lose; for all others there is no acknowledgement, as recorded (failures.json)."""
+        if self.schedule is None or int(self._autopilot.parameters.get("SYS_FAILURE_EN")) != 1:
+            return Result.DENIED
+        unit, kind = whole(command.p1), whole(command.p2)
+        if unit not in _FAILURES or kind not in (mav.FAILURE_TYPE_OK, mav.FAILURE_TYPE_OFF):
+            return None
+        for name, parameters in _FAILURES[unit]:
+            now_s = self._telemetry.now_s()
+            if kind == mav.FAILURE_TYPE_OFF:
+                self.schedule.add(Fault(kind=name, start_s=now_s, parameters=parameters))
+            else:
+                self.schedule.end(name, now_s)
+        return Result.ACCEPTED
 
     def _set_interval(self, command: Command, link: Link) -> Result:
         name = self._telemetry.name_of(whole(command.p1))

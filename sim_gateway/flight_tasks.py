@@ -18,6 +18,7 @@ from sim_gateway.sticks import Sticks
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _STOPPED_M_S = 0.15
 _BRAKE_TIMEOUT_S = 3.0
+_DESCEND_M_S = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +192,21 @@ class LandTask:
         spot = (NAN, NAN, NAN) if self.target is None else (self.target[0], self.target[1], NAN)
         target = OffboardSetpoint(spot, velocity, NOTHING, yaw, 0.0)
         return MotionCommand(velocity, yaw_rate_towards(yaw, state, self.parameters), target)
+
+
+@dataclass(slots=True)
+class DescendTask:
+    """Without a position: level and down at `_DESCEND_M_S` (recorded about 0.8 m/s), carried by the wind."""
+
+    parameters: ParameterStore
+    state_at_entry: NedState
+    finished: bool = False
+    landing: bool = True
+
+    def update(self, state: NedState, dt_s: float) -> MotionCommand:
+        """Setpoint of the descent."""
+        velocity = (state.velocity[0], state.velocity[1], _DESCEND_M_S)
+        return MotionCommand(velocity, 0.0, OffboardSetpoint(NOTHING, velocity, NOTHING, NAN, 0.0))
 
 
 def return_height_m(distance_m: float, height_m: float, parameters: ParameterStore) -> float:

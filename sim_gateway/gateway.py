@@ -15,14 +15,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_gateway.faults import Fault
 from sim_gateway.flight_report import FlightRecorder, write_json_atomically
+from sim_gateway.incidents import Incidents
 from sim_gateway.lidar import LidarConfig
+from sim_gateway.link_faults import LinkFaults
+from sim_gateway.mavlink_links import UdpLink
 from sim_gateway.mavlink_server import MavlinkServer
 from sim_gateway.piloted import PilotedVehicle
+from sim_gateway.report_faults import ReportFaults
 from sim_gateway.scene import Point, World
 from sim_gateway.scip import DEFAULT_PORT, ScipServer
 from sim_gateway.serial_lidar import SerialLidar
-from sim_gateway.simulation import Simulation, WindConfig, step_at
+from sim_gateway.simulation import Scan, Simulation, WindConfig, step_at
 from sim_gateway.telemetry import Telemetry
 from sim_gateway.vehicle import STEP_S
 
@@ -54,6 +59,16 @@ class GatewayConfig:
     report: Path | None = None
     serial_lidar: str | None = None
     serial_link: Path | None = None
+    faults: tuple[Fault, ...] = ()
+
+
+def connect_faults(vehicle: PilotedVehicle, server: MavlinkServer, telemetry: Telemetry, seed: int) -> Incidents:
+    """Let the faults of the vehicle's simulation reach its reports and its first link; call the result's `step`."""
+    schedule = vehicle.simulation.faults
+    telemetry.faults = ReportFaults(schedule, vehicle.simulation.motion_faults)
+    server.links[0].faults = LinkFaults(schedule, seed)
+    server.commands.schedule = schedule
+    return Incidents(vehicle, server, telemetry)
 
 
 def _simulation(world: World, config: GatewayConfig) -> Simulation:
@@ -87,6 +102,9 @@ class Gateway:
         onboard = (config.onboard_port + ONBOARD_PORT_OFFSET, config.onboard_port)
         ground = (config.gcs_port + GROUND_PORT_OFFSET, config.gcs_port) if config.gcs_port else None
         self.server = MavlinkServer(pilot, frame, self.telemetry, onboard, ground)
+        self.incidents = connect_faults(self.vehicle, self.server, self.telemetry, config.seed)
+        for fault in config.faults:
+            self.vehicle.simulation.inject(fault)
         self.carry: Callable[[float], tuple[Point, float]] | None = None
         self.alter_scan: Callable[[NDArray[np.float32]], NDArray[np.float32] | None] | None = None
         self.lidar = ScipServer(lambda: self.vehicle.time_s, config.lidar_port)
@@ -151,7 +169,7 @@ class Gateway:
         """Sleep until the next step is due; what arrives meanwhile is handled at once."""
         if seconds <= 0.0:
             return
-        sockets = [link.socket for link in self.server.links]
+        sockets = [link.socket for link in self.server.links if isinstance(link, UdpLink)]
         readable, _, _ = select.select(sockets, [], [], min(seconds, _LONGEST_WAIT_S))
         if readable:
             self.server.poll()
@@ -167,13 +185,17 @@ class Gateway:
             self.serial_lidar.advance(vehicle.simulation)
         if vehicle.simulation.steps >= step_at(self._scans * 0.05):
             self._scans += 1
-            scan = vehicle.simulation.scan()
-            ranges = self.alter_scan(scan.ranges_m) if self.alter_scan is not None else scan.ranges_m
-            if ranges is not None:
-                self.lidar.publish(scan.time_s, ranges)
-                self.telemetry.scan = replace(scan, ranges_m=ranges)
+            for scan in vehicle.simulation.device_scans():
+                self._publish(scan)
+        self.incidents.step()
         self.server.poll()
         self._note_changes()
+
+    def _publish(self, scan: Scan) -> None:
+        ranges = self.alter_scan(scan.ranges_m) if self.alter_scan is not None else scan.ranges_m
+        if ranges is not None:
+            self.lidar.publish(scan.time_s, ranges)
+            self.telemetry.scan = replace(scan, ranges_m=ranges)
 
     def _note_changes(self) -> None:
         pilot = self.vehicle.autopilot
@@ -194,6 +216,11 @@ class Gateway:
         factor = round(self.vehicle.time_s / elapsed_s, 4)
         content = self.recorder.as_dict(real_time_factor=factor, dropped_s=round(self.dropped_s, 3))
         content["received"] = self._received()
+        content["setpoints"] = self._setpoints()
+        content["faults"] = [
+            {"kind": item.kind, "begin_s": round(item.begin_s, 3), "end_s": item.end_s if math.isfinite(item.end_s) else None}
+            for item in self.vehicle.simulation.faults.placed
+        ]
         try:
             write_json_atomically(self.config.report, content)
         except OSError as error:
@@ -208,6 +235,12 @@ class Gateway:
             {"what": what, "from": f"{sender[0]}/{sender[1]}", "count": len(times), "first_s": times[0], "last_s": times[-1]}
             for (what, sender), times in found.items()
         ]
+
+    def _setpoints(self) -> dict[str, Any]:
+        """The newest velocity setpoints as they arrived: vehicle time, NED m/s, clockwise rad/s, sender."""
+        log = [item for item in self.server.wire_log if item.velocity is not None]
+        rows = [[round(item.time_s, 3), *(round(v, 5) for v in item.velocity or ()), *item.sender] for item in log]
+        return {"columns": ["t", "north", "east", "down", "yaw_rate", "system", "component"], "rows": rows}
 
     def _facts(self) -> dict[str, Any]:
         world, config = self.world, self.config

@@ -6,38 +6,28 @@ and to every loopback address that has spoken to it lately. Nothing blocks; ever
 
 from __future__ import annotations
 
-import errno
 import logging
 import math
-import socket
-import struct
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import development as mav
 
-from sim_gateway.autopilot import CRITICAL, Autopilot, StatusText
+from sim_gateway.autopilot import CRITICAL, Autopilot
 from sim_gateway.commands import Command, CommandHandler
 from sim_gateway.fence import FENCE, FenceStore
 from sim_gateway.flight_modes import FlightMode, Result
 from sim_gateway.local_frame import LocalFrame
+from sim_gateway.mavlink_links import MavlinkLink, PortInUseError, UdpLink
 from sim_gateway.parameters import HASH_INDEX, HASH_NAME, UINT32, ParameterStore
 from sim_gateway.setpoints import NAN, NOTHING, SetpointRefusedError, read_setpoint
 from sim_gateway.sticks import from_manual_control
-from sim_gateway.telemetry import COMPONENT_ID, GROUND, ONBOARD, STREAM_RATES_HZ, SYSTEM_ID, Message, Telemetry
+from sim_gateway.telemetry import COMPONENT_ID, GROUND, ONBOARD, SYSTEM_ID, Message, Telemetry
 
-LOOPBACK = "127.0.0.1"
 ONBOARD_PORTS = (14580, 14540)  # own port, client's port
 GROUND_PORTS = (18570, 14550)
-_MAX_DATAGRAM = 4096
-_DATAGRAMS_PER_POLL = 100  # more wait in the socket's own, bounded, buffer
-_PEERS_PER_LINK = 8
-_PEER_TIMEOUT_S = 10.0
-_GCS_TIMEOUT_S = 5.0
-_TEXT_CHUNK = 50
 _PARAMS_PER_POLL = 5
-_MIN_INTERVAL_US = 1000.0
 _GLOBAL_FRAMES = (0, 5, 3, 6)  # absolute and relative altitude
 _RELATIVE_FRAMES = (3, 6)
 
@@ -63,154 +53,17 @@ _SETPOINTS_LOGGED = (
 _log = logging.getLogger("sim_gateway.mavlink")
 
 
-class PortInUseError(OSError):
-    """A port the gateway needs is taken; the message names it."""
-
-
 @dataclass(frozen=True, slots=True)
 class Received:
-    """One message that moves, arms or configures the vehicle, as it came off the wire. `what`: message or command name."""
+    """One message that moves, arms or configures the vehicle, as it came off the wire. `what`: message or command name.
+
+    `velocity`: of a local velocity setpoint, NED m/s and clockwise rad/s.
+    """
 
     time_s: float
     what: str
     sender: tuple[int, int]
-
-
-@dataclass(slots=True)
-class _Stream:
-    interval_s: float
-    due_s: float
-
-
-def _bind(port: int, purpose: str) -> socket.socket:
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sock.setblocking(False)
-    try:
-        sock.bind((LOOPBACK, port))
-    except OSError as error:
-        sock.close()
-        reason = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
-        raise PortInUseError(f"UDP port {port} ({purpose}) {reason}") from error
-    return sock
-
-
-class MavlinkLink:
-    """One UDP link: its peers, its streams, its parser."""
-
-    def __init__(self, name: str, own_port: int, client_port: int, column: int, now_s: Callable[[], float]) -> None:
-        self.name = name
-        self.socket = _bind(own_port, f"{name} link")
-        self._client = (LOOPBACK, client_port)
-        self._now_s = now_s
-        self._column = column
-        self._peers: dict[tuple[str, int], float] = {}
-        self._packer = mav.MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=COMPONENT_ID)
-        self._defaults = {n: 1.0 / rates[column] for n, rates in STREAM_RATES_HZ.items() if rates[column] > 0}
-        self.streams = {name: _Stream(interval, 0.0) for name, interval in self._defaults.items()}
-        self.parameter_queue: deque[str] = deque()
-        self.gcs_heard_s = -math.inf
-        self._text_id = 0
-
-    @property
-    def has_gcs(self) -> bool:
-        """Whether a ground station's heartbeat came lately: only then PX4 sends STATUSTEXT here."""
-        return self._now_s() - self.gcs_heard_s < _GCS_TIMEOUT_S
-
-    def close(self) -> None:
-        """Free the port."""
-        self.socket.close()
-
-    # ---- out
-
-    def send(self, message: Message) -> None:
-        """Send to all peers; a full or unreachable socket loses the message, as UDP does."""
-        try:
-            data = message.pack(self._packer)
-        except (struct.error, OverflowError, ValueError) as error:
-            _log.error("message %s has a value outside its field: %s", message.get_type(), error)
-            return
-        for peer in (self._client, *self._peers):
-            try:
-                self.socket.sendto(data, peer)
-            except OSError as error:
-                _log.debug("%s to %s lost: %s", message.get_type(), peer, error)
-
-    def send_text(self, text: StatusText) -> None:
-        """STATUSTEXT in pieces of 50 characters; like PX4's, a text that fills its last piece is followed by an empty one."""
-        data = text.text.encode("ascii", "replace")
-        if len(data) < _TEXT_CHUNK:
-            self.send(mav.MAVLink_statustext_message(text.severity, data))
-            return
-        self._text_id = self._text_id % 0xFFFF + 1
-        for chunk in range(min(len(data) // _TEXT_CHUNK + 1, 255)):
-            piece = data[chunk * _TEXT_CHUNK : (chunk + 1) * _TEXT_CHUNK]
-            self.send(mav.MAVLink_statustext_message(text.severity, piece, self._text_id, chunk))
-
-    def set_interval(self, name: str, interval_us: float) -> None:
-        """Stream `name` at this interval: 0 its default, negative off. Faster than 1 kHz is not possible."""
-        interval_s = self._defaults.get(name, -1.0) if interval_us == 0 else max(interval_us, _MIN_INTERVAL_US) * 1e-6
-        if interval_us < 0 or interval_s < 0:
-            self.streams.pop(name, None)
-        else:
-            self.streams[name] = _Stream(interval_s, self._now_s())
-
-    def interval_us(self, name: str) -> int:
-        """The interval in force; -1 when the message is not streamed."""
-        stream = self.streams.get(name)
-        return -1 if stream is None else round(stream.interval_s * 1e6)
-
-    def due(self, available: Callable[[str], bool]) -> list[str]:
-        """Names of the messages whose time has come. A stream that fell behind skips what it missed."""
-        now_s, names = self._now_s(), []
-        for name, stream in self.streams.items():
-            if now_s >= stream.due_s - 1e-9 and available(name):
-                names.append(name)
-                behind = now_s - stream.due_s > stream.interval_s
-                stream.due_s = now_s + stream.interval_s if behind else stream.due_s + stream.interval_s
-        return names
-
-    # ---- in
-
-    def receive(self) -> list[Message]:
-        """The valid messages that have arrived; bad bytes, wrong checksums and foreign hosts are dropped."""
-        messages: list[Message] = []
-        self._forget_silent_peers()
-        for _ in range(_DATAGRAMS_PER_POLL):
-            try:
-                data, peer = self.socket.recvfrom(_MAX_DATAGRAM)
-            except BlockingIOError:
-                break
-            except OSError as error:
-                _log.debug("receiving on the %s link: %s", self.name, error)
-                continue
-            found = _parse(data)
-            if found:
-                self._remember(peer)
-            messages.extend(found)
-        return messages
-
-    def _remember(self, peer: tuple[str, int]) -> None:
-        """Answer a client on another port too, for as long as it speaks."""
-        known = peer in self._peers or len(self._peers) < _PEERS_PER_LINK
-        if peer != self._client and known and peer[0].startswith("127."):
-            self._peers[peer] = self._now_s()
-
-    def _forget_silent_peers(self) -> None:
-        if self._peers:
-            oldest_s = self._now_s() - _PEER_TIMEOUT_S
-            self._peers = {peer: heard_s for peer, heard_s in self._peers.items() if heard_s >= oldest_s}
-
-
-def _parse(data: bytes) -> list[Message]:
-    """Messages of one datagram. A fresh parser each time: a truncated frame cannot swallow the next datagram."""
-    parser = mav.MAVLink(None)
-    parser.robust_parsing = True
-    try:
-        found = parser.parse_buffer(data) or []
-    except (mav.MAVError, struct.error, ValueError, IndexError) as error:
-        _log.debug("datagram dropped: %s", error)
-        return []
-    return [message for message in found if message.get_type() != "BAD_DATA" and not message.get_type().startswith("UNKNOWN")]
+    velocity: tuple[float, float, float, float] | None = None
 
 
 class MavlinkServer:
@@ -223,17 +76,13 @@ class MavlinkServer:
         telemetry: Telemetry,
         onboard_ports: tuple[int, int] = ONBOARD_PORTS,
         ground_ports: tuple[int, int] | None = GROUND_PORTS,
+        links: list[MavlinkLink] | None = None,
     ) -> None:
+        """`links`: these instead of UDP on the ports."""
         self._autopilot, self._frame, self._telemetry = autopilot, frame, telemetry
         self._now = telemetry.now_s
-        self._commands = CommandHandler(autopilot, telemetry, frame)
-        self.links = [MavlinkLink("onboard", *onboard_ports, ONBOARD, self._now)]
-        try:
-            if ground_ports is not None:
-                self.links.append(MavlinkLink("ground station", *ground_ports, GROUND, self._now))
-        except PortInUseError:
-            self.links[0].close()
-            raise
+        self.commands = CommandHandler(autopilot, telemetry, frame)
+        self.links = links if links is not None else self._udp_links(onboard_ports, ground_ports)
         self._shown_mode: tuple[FlightMode, FlightMode] | None = None
         self._shown_landed = -1
         self.fence = FenceStore(self._now)
@@ -260,10 +109,24 @@ class MavlinkServer:
             "PING": self._on_ping,
         }
 
+    def _udp_links(self, onboard_ports: tuple[int, int], ground_ports: tuple[int, int] | None) -> list[MavlinkLink]:
+        links: list[MavlinkLink] = [UdpLink("onboard", *onboard_ports, ONBOARD, self._now)]
+        try:
+            if ground_ports is not None:
+                links.append(UdpLink("ground station", *ground_ports, GROUND, self._now))
+        except PortInUseError:
+            links[0].close()
+            raise
+        return links
+
     def close(self) -> None:
         """Free the ports."""
         for link in self.links:
             link.close()
+
+    def take(self, message: Message) -> None:
+        """A packed message from somebody who is on no link of its own (`incidents`)."""
+        self._dispatch(message, self.links[0])
 
     def poll(self) -> None:
         """Handle everything that has arrived and send everything that is due. Never blocks."""
@@ -277,6 +140,7 @@ class MavlinkServer:
                 link.send(self._telemetry.build(name))
             for _ in range(min(_PARAMS_PER_POLL, len(link.parameter_queue))):
                 self._send_parameter(link.parameter_queue.popleft(), link)
+            link.flush()
 
     def _send_changes(self) -> None:
         """What PX4 sends at once: texts, a new mode, a new landed state."""
@@ -311,7 +175,7 @@ class MavlinkServer:
             self.counts[name, *sender] += 1
         command = _COMMANDS_LOGGED.get(message.command) if name in ("COMMAND_LONG", "COMMAND_INT") else None
         if name in _SETPOINTS_LOGGED or command is not None:
-            self.wire_log.append(Received(self._now(), command or name, sender))
+            self.wire_log.append(Received(self._now(), command or name, sender, _velocity(message, name)))
 
     def _on_manual_control(self, m: Message, _: MavlinkLink) -> None:
         """A joystick. Its target field is a system id of its own name."""
@@ -331,7 +195,7 @@ class MavlinkServer:
         def acknowledge(result: Result) -> None:
             link.send(mav.MAVLink_command_ack_message(command.number, int(result), 0, 0, *sender))
 
-        self._commands.run(command, link, acknowledge)
+        self.commands.run(command, link, acknowledge)
 
     def _on_command_long(self, m: Message, link: MavlinkLink) -> None:
         params = (m.param1, m.param2, m.param3, m.param4)
@@ -451,11 +315,19 @@ class MavlinkServer:
 
     def _on_timesync(self, m: Message, link: MavlinkLink) -> None:
         if m.tc1 == 0:
-            link.send(mav.MAVLink_timesync_message(int(self._now() * 1e9), m.ts1))
+            link.send(mav.MAVLink_timesync_message(int(self._telemetry.boot_s() * 1e9), m.ts1))
 
     def _on_ping(self, m: Message, link: MavlinkLink) -> None:
         if m.target_system == 0 and m.target_component == 0:
             link.send(mav.MAVLink_ping_message(m.time_usec, m.seq, m.get_srcSystem(), m.get_srcComponent()))
+
+
+def _velocity(m: Message, name: str) -> tuple[float, float, float, float] | None:
+    """What a velocity setpoint asks for; None for other messages and for what is not finite."""
+    if name != "SET_POSITION_TARGET_LOCAL_NED":
+        return None
+    values = (m.vx, m.vy, m.vz, m.yaw_rate)
+    return values if all(map(math.isfinite, values)) else None
 
 
 def _is_pilot(message: Message) -> bool:

@@ -76,7 +76,7 @@ class PilotedVehicle:
 
     def ned_state(self) -> NedState:
         """The estimate as the autopilot takes it."""
-        motion, frame = self.simulation.estimate(), self.frame
+        motion, frame = self.simulation.estimate(acceleration_noise=False), self.frame
         return NedState(
             motion.time_s,
             frame.point_to_ned(motion.position_m),

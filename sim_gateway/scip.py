@@ -114,8 +114,8 @@ class ScipServer:
             self._thread.join(_START_STOP_DEADLINE_S)
 
     def publish(self, scan_time_s: float, ranges_m: NDArray[np.floating]) -> None:
-        """Hand over a full scan: `ranges_m` [steps] in m, first step (rightmost) first; see `ScipGeometry.codes`."""
-        codes = self.device.geometry.codes(ranges_m)
+        """Hand over a full scan: `ranges_m` [steps] in m, first step (rightmost) first; see `ScipGeometry.sent_codes`."""
+        codes = self.device.geometry.sent_codes(ranges_m)
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the server was stopped: nobody listens any more
                 self._loop.call_soon_threadsafe(self._deliver, scan_time_s, codes)

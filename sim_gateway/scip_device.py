@@ -20,6 +20,8 @@ NO_ECHO = 1  # range codes below DMIN
 TOO_NEAR = 2
 OTHER_ERROR = 5
 _USER_STRING_MAX = 16
+_ABSURD = 2.0  # times the range: no noise makes this
+_LARGEST = 0xFFFF
 _BLOCK = 64  # characters of scan data per checked line
 _STANDBY, _SINGLE, _MULTI, _TIME = "standby", "single", "multi", "time"
 _STATE_CODES = {_STANDBY: b"000", _TIME: b"002", _SINGLE: b"003", _MULTI: b"004"}
@@ -57,6 +59,16 @@ class ScipGeometry:
         mm = np.rint(np.nan_to_num(ranges, nan=0.0, posinf=1e6, neginf=0.0) * 1000.0)
         codes = np.where(mm > self.range_max_mm, NO_ECHO, np.where(mm < self.range_min_mm, TOO_NEAR, mm))
         return np.where(np.isnan(ranges), OTHER_ERROR, codes).astype(np.int64)
+
+
+    def sent_codes(self, ranges_m: NDArray[np.floating]) -> NDArray[np.int64]:
+        """As `codes`, of a device that may be faulty: fewer steps break off, a number far beyond the range is sent as it is."""
+        ranges = np.full(self.steps, np.inf)
+        ranges[: ranges_m.size] = ranges_m[: self.steps]
+        codes = self.codes(ranges)
+        absurd = np.isfinite(ranges) & (ranges > _ABSURD * self.range_max_mm * 1e-3)
+        codes[absurd] = np.minimum(np.rint(ranges[absurd] * 1000.0), _LARGEST).astype(np.int64)
+        return codes[: ranges_m.size]
 
 
 @dataclass(frozen=True, slots=True)

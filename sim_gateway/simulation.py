@@ -33,7 +33,10 @@ from sim_gateway.estimate import (
     initial_error,
     step_error,
 )
+from sim_gateway.faults import Fault, FaultSchedule
 from sim_gateway.lidar import Lidar, LidarConfig
+from sim_gateway.motion_faults import MotionFaults
+from sim_gateway.scan_faults import ScanFaults
 from sim_gateway.scene import Boxes, Point, World, place_movers
 from sim_gateway.vehicle import (
     ACC,
@@ -57,6 +60,7 @@ Array = NDArray[np.float64]
 MAX_STEPS_PER_CALL = 250 * 3600
 _NORMALS = PROCESSES + 3  # one step's draws: estimate errors, then gusts
 _SCAN_STREAM, _ACCELERATION_STREAM = 0, 1
+_NO_ERROR, _NO_NOISE = np.zeros(ERROR_SIZE), np.zeros(3)
 
 # running log of the kernel
 _LEAST_CLEARANCE, _TOUCHING, _CONTACTS, _FLOWN = 0, 1, 2, 3
@@ -141,6 +145,33 @@ def _advance(  # type: ignore[no-untyped-def]
         _watch_clearance(boxes, state, radius, log)
 
 
+@njit(cache=True)
+def _read_motion(state: Array, error: Array, acceleration_error: Array, out: Array) -> None:
+    """Position, velocity, acceleration, roll, pitch, yaw (not wrapped) and body rates with their errors into `out` [15]."""
+    for i in range(3):
+        out[i] = state[POS + i] + error[POSITION_ERROR + i] + error[POSITION_BIAS + i]
+        out[3 + i] = state[VEL + i] + error[VELOCITY_ERROR + i]
+        out[6 + i] = state[ACC + i] + acceleration_error[i]
+        out[12 + i] = state[OMEGA + i]
+    roll, pitch = roll_pitch_rad(state)
+    out[9], out[10], out[11] = roll + error[ATTITUDE_ERROR], pitch + error[ATTITUDE_ERROR + 1], yaw_rad(state) + error[ATTITUDE_ERROR + 2]
+
+
+class SensorNoise:
+    """Random numbers of one sensor: counter-based, so that those of a time do not depend on what was read before."""
+
+    def __init__(self, key: NDArray[np.uint64]) -> None:
+        self._bits = np.random.Philox(key=key)
+        self._generator = np.random.Generator(self._bits)
+        self._fresh = self._bits.state
+
+    def at(self, step: int) -> np.random.Generator:
+        """The generator at the start of its numbers for a step. The same object each time: draw before asking again."""
+        self._fresh["state"]["counter"][2] = step
+        self._bits.state = self._fresh
+        return self._generator
+
+
 def step_at(time_s: float) -> int:
     """Number of the physics step nearest to `time_s` (halves round up): tick k of 20 Hz is at `step_at(k * 0.05)`.
 
@@ -182,11 +213,15 @@ class Simulation:
         flying = hover_height_m is not None
         place = (*world.start[:2], world.start[2] if hover_height_m is None else hover_height_m)
         self._state = initial_state(place, world.start_yaw_rad, flying, params)
+        self._reading = np.empty(15)
         self._boxes = world.boxes_at(0.0)
         self._generator = np.random.Generator(np.random.PCG64([seed, 0]))
-        self._sensor_keys = [np.random.SeedSequence([seed, 1, i]).generate_state(2, np.uint64) for i in range(2)]
+        self._sensors = [SensorNoise(np.random.SeedSequence([seed, 1, i]).generate_state(2, np.uint64)) for i in range(2)]
         self._start_errors(estimate_preset(estimate) if isinstance(estimate, str) else estimate)
         self._start_wind(wind)
+        self.faults = FaultSchedule()
+        self.motion_faults = MotionFaults(self.faults)
+        self._scan_faults = ScanFaults(self.faults, seed)
         self._log = np.array([math.inf, 0.0, 0.0, 0.0])
         _watch_clearance(self._boxes, self._state, contact_radius_m, self._log)
 
@@ -202,6 +237,10 @@ class Simulation:
         self._wind_mean = np.array(wind.mean_m_s, dtype=np.float64)
         self._gust = wind.gust_sigma_m_s * self._generator.standard_normal(3)
         self._gust_coefficients = np.array([decay, wind.gust_sigma_m_s * math.sqrt(1.0 - decay * decay)])
+
+    def inject(self, fault: Fault) -> None:
+        """Let something go wrong; see `sim_gateway.faults`. Faults of links and reports need the gateway around this."""
+        self.faults.add(fault)
 
     # time
 
@@ -234,11 +273,23 @@ class Simulation:
     def _step(self, n_steps: int, setpoint: Array, yaw_rate_sp: float, *, motors_on: bool) -> None:
         if not 0 <= n_steps <= MAX_STEPS_PER_CALL:
             raise ValueError(f"n_steps is {n_steps}: it must lie in 0..{MAX_STEPS_PER_CALL}")
+        if not self.motion_faults.any:
+            self._step_alike(n_steps, setpoint, yaw_rate_sp, self._params, self._wind_mean, motors_on=motors_on)
+            return
+        faults, end = self.motion_faults, self.steps + n_steps
+        while self.steps < end:
+            now_s, steps = self.time_s, faults.steps_alike(self.steps, end - self.steps)
+            params, wind = faults.params(self._params, now_s), self._wind_mean + faults.wind(now_s)
+            self._step_alike(steps, faults.setpoint(setpoint, now_s), yaw_rate_sp, params, wind, motors_on=motors_on)
+
+    def _step_alike(
+        self, n_steps: int, setpoint: Array, yaw_rate_sp: float, params: Array, wind_mean: Array, *, motors_on: bool
+    ) -> None:
         normals = self._generator.standard_normal((n_steps, _NORMALS))
         _advance(
-            *(self._state, self._params, setpoint, yaw_rate_sp, motors_on, normals, self.steps),
+            *(self._state, params, setpoint, yaw_rate_sp, motors_on, normals, self.steps),
             *(self._boxes, len(self.world.static_boxes), self.world.mover_rows),
-            *(self._error, self._coefficients, self._wind_mean, self._gust, self._gust_coefficients),
+            *(self._error, self._coefficients, wind_mean, self._gust, self._gust_coefficients),
             *(self.contact_radius_m, self._log),
         )
         self.steps += n_steps
@@ -248,28 +299,31 @@ class Simulation:
     @property
     def truth(self) -> Motion:
         """What really is."""
-        return self._motion(np.zeros(ERROR_SIZE), np.zeros(3))
+        return self._motion(_NO_ERROR, _NO_NOISE)
 
-    def estimate(self) -> Motion:
-        """What the vehicle believes: truth plus the estimate's errors. Reading twice at one time gives the same."""
-        noise = self._sensor_generator(_ACCELERATION_STREAM).standard_normal(3)
-        return self._motion(self._error, self._acceleration_sigma * noise)
+    def estimate(self, *, acceleration_noise: bool = True) -> Motion:
+        """What the vehicle believes: truth plus the estimate's errors. Reading twice at one time gives the same.
+
+        Without `acceleration_noise` the acceleration is the true one: quicker, for readers that have no use for it.
+        """
+        motion = self._motion(self._error, self._acceleration_error() if acceleration_noise else _NO_NOISE)
+        return self.motion_faults.estimate(motion) if self.motion_faults.any else motion
+
+    def _acceleration_error(self) -> Array:
+        if not self._acceleration_sigma.any():
+            return _NO_NOISE
+        return self._acceleration_sigma * self._sensors[_ACCELERATION_STREAM].at(self.steps).standard_normal(3)
 
     def _motion(self, error: Array, acceleration_error: Array) -> Motion:
-        state = self._state
-        position = state[POS : POS + 3] + error[POSITION_ERROR : POSITION_ERROR + 3] + error[POSITION_BIAS : POSITION_BIAS + 3]
-        roll, pitch = roll_pitch_rad(state)
-        heading = math.remainder(yaw_rad(state) + error[ATTITUDE_ERROR + 2], 2.0 * math.pi)
-        return Motion(
-            time_s=self.time_s,
-            position_m=_triple(position),
-            velocity_m_s=_triple(state[VEL : VEL + 3] + error[VELOCITY_ERROR : VELOCITY_ERROR + 3]),
-            acceleration_m_s2=_triple(state[ACC : ACC + 3] + acceleration_error),
-            roll_rad=roll + float(error[ATTITUDE_ERROR]),
-            pitch_rad=pitch + float(error[ATTITUDE_ERROR + 1]),
-            yaw_rad=heading,
-            angular_rate_rad_s=_triple(state[OMEGA : OMEGA + 3]),
-        )
+        _read_motion(self._state, error, acceleration_error, self._reading)
+        x, y, z, vx, vy, vz, ax, ay, az, roll, pitch, heading, p, q, r = self._reading.tolist()
+        yaw = math.remainder(heading, 2.0 * math.pi)
+        return Motion(self.time_s, (x, y, z), (vx, vy, vz), (ax, ay, az), roll, pitch, yaw, (p, q, r))
+
+    @property
+    def truth_position_m(self) -> Point:
+        """Where the vehicle really is."""
+        return _triple(self._state[POS : POS + 3])
 
     @property
     def landed(self) -> bool:
@@ -279,7 +333,7 @@ class Simulation:
     @property
     def wind_m_s(self) -> Point:
         """The wind now."""
-        return _triple(self._wind_mean + self._gust)
+        return _triple(self._wind_mean + self._gust + self.motion_faults.wind(self.time_s))
 
     @property
     def state_row(self) -> Array:
@@ -295,11 +349,15 @@ class Simulation:
 
     def scan(self) -> Scan:
         """What the scanner sees now, from the vehicle's true place and tilt. Reading twice at one time gives the same."""
-        generator = self._sensor_generator(_SCAN_STREAM)
+        generator = self._sensors[_SCAN_STREAM].at(self.steps)
         ranges = self._lidar.scan(self._boxes, self._state[POS : POS + 3], rotation(self._state), generator)
         config = self._lidar.config
         angles = (config.angle_min_rad, config.angle_increment_rad)
         return Scan(self.time_s, ranges.astype(np.float32), *angles, config.range_min_m, config.range_max_m)
+
+    def device_scans(self) -> list[Scan]:
+        """What leaves the scanner at its scan time now: the scan it measured, or what LiDAR faults make of it. Once per scan."""
+        return self._scan_faults.pass_on(self.scan())
 
     def boxes(self) -> Boxes:
         """All boxes where they are now, static ones first: a copy, float64 [m, 6]."""
@@ -324,10 +382,6 @@ class Simulation:
     def flown_m(self) -> float:
         """Length of the true path so far, at 250 Hz."""
         return float(self._log[_FLOWN])
-
-    def _sensor_generator(self, stream: int) -> np.random.Generator:
-        """Noise of one sensor at the current time: counter-based, so that it does not depend on what was read before."""
-        return np.random.Generator(np.random.Philox(key=self._sensor_keys[stream], counter=[0, 0, self.steps, 0]))
 
 
 def _triple(values: Array) -> Point:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from pymavlink.dialects.v20 import development as mav
 
@@ -19,6 +19,9 @@ from sim_gateway.local_frame import LocalFrame, Vector
 from sim_gateway.obstacle_distance import obstacle_distance
 from sim_gateway.setpoints import OffboardSetpoint
 from sim_gateway.simulation import Scan
+
+if TYPE_CHECKING:
+    from sim_gateway.report_faults import ReportFaults
 
 Message = Any  # pymavlink publishes no types
 Quaternion = tuple[float, float, float, float]
@@ -70,6 +73,7 @@ _FROM_S = {
 _SENSORS = 0x1 | 0x2 | 0x4 | 0x8  # gyro, accelerometer, magnetometer, barometer
 _CONTROLS = 0x400 | 0x800 | 0x1000 | 0x2000 | 0x4000 | 0x8000
 _GPS, _AHRS, _BATTERY, _PREARM = 0x20, 0x200000, 0x2000000, 0x10000000
+_NO_POSITION_FLAGS = 2 | 8 | 16  # of ESTIMATOR_STATUS: horizontal velocity, relative and absolute position
 _MAGNETIC_FIELD_NED_GAUSS: Vector = (0.212, 0.009, 0.427)  # at PX4's default place
 _EPOCH_US = int(time.time() * 1e6)
 
@@ -111,7 +115,8 @@ class Telemetry:
     """Builds messages for the vehicle's present state. `snapshot` is called once per message, `now_s` gives vehicle time.
 
     `scan`: the newest scan, set by who has the LiDAR; OBSTACLE_DISTANCE tells of it.
-    Fault switches: messages named in `silent` are not streamed, and `alter[name]` may change a message before it is sent.
+    Fault switches: messages named in `silent` are not streamed, and `alter[name]` may change a message before it is sent;
+    `faults` are those of the schedule. `booted_s`: vehicle time of the last start, from which its messages count.
     """
 
     def __init__(
@@ -122,6 +127,8 @@ class Telemetry:
         self._frame = frame
         self._snapshot = snapshot
         self._sequence = 0
+        self.booted_s = 0.0
+        self.faults: ReportFaults | None = None
         self.scan: Scan | None = None
         self.silent: set[str] = set()
         self.alter: dict[str, Callable[[Message], None]] = {}
@@ -138,11 +145,24 @@ class Telemetry:
         """Whether start-up has come far enough for this message, and what it tells of is there."""
         if name in self.silent or (name == "OBSTACLE_DISTANCE" and self.scan is None):
             return False
-        return self.now_s() >= _FROM_S.get(name, LOCAL_FROM_S)
+        if self.faults is not None and self.faults.silences(name, self.now_s()):
+            return False
+        return self.now_s() - self.booted_s >= _FROM_S.get(name, LOCAL_FROM_S)
+
+    def boot_s(self) -> float:
+        """The vehicle's own clock: time since its last start."""
+        return self.now_s() - self.booted_s
 
     def build(self, name: str) -> Message:
         """The message now; raises KeyError for a name outside the tables."""
-        message = self._builders[name](self._snapshot())
+        now = self._snapshot()
+        if self.faults is not None:
+            now = self.faults.snapshot(name, now)
+        if self.booted_s:
+            now = replace(now, time_s=now.time_s - self.booted_s)
+        message = self._builders[name](now)
+        if self.faults is not None:
+            self.faults.alter(name, message, self.now_s())
         if name in self.alter:
             self.alter[name](message)
         return message
@@ -172,14 +192,18 @@ class Telemetry:
         health = _SENSORS | _CONTROLS | _BATTERY
         health |= _GPS | _AHRS if self._autopilot.healthy else 0
         health |= _PREARM if self._autopilot.can_arm or self._autopilot.armed else 0
-        return mav.MAVLink_sys_status_message(present, present, health, 300, 16200, 0, 100, 0, 0, 0, 0, 0, 0)
+        battery = self._autopilot.battery
+        millivolts = round(1000 * battery.volts)
+        return mav.MAVLink_sys_status_message(present, present, health, 300, millivolts, 0, battery.percent, 0, 0, 0, 0, 0, 0)
 
     def _battery_status(self, _: Snapshot) -> Message:
-        cells = [4050] * 4 + [65535] * 6
-        return mav.MAVLink_battery_status_message(0, 0, 0, 32767, cells, 0, 0, -1, 100, 0, mav.MAV_BATTERY_CHARGE_STATE_OK)
+        battery = self._autopilot.battery
+        cells = [round(250 * battery.volts)] * 4 + [65535] * 6
+        return mav.MAVLink_battery_status_message(0, 0, 0, 32767, cells, 0, 0, -1, battery.percent, 0, battery.charge_state)
 
     def _estimator_status(self, now: Snapshot) -> Message:
         flags = 0x33F if now.time_s >= POSITION_FLAG_FROM_S else 0x27
+        flags &= ~_NO_POSITION_FLAGS if self._autopilot.position_given_up else ~0
         return mav.MAVLink_estimator_status_message(self._usec(now), flags, 0.1, 0.1, 0.1, 0.1, 0.0, 0.0, 0.3, 0.4)
 
     def _autopilot_version(self, _: Snapshot) -> Message:
@@ -298,8 +322,9 @@ class Telemetry:
         speed = math.hypot(now.velocity[0], now.velocity[1])
         course = round(_heading_deg(math.atan2(now.velocity[1], now.velocity[0])) * 100) % 36000
         place = (round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3))
+        fix, satellites = (3, 16) if self._autopilot.gps_fix else (0, 0)
         return mav.MAVLink_gps_raw_int_message(
-            self._usec(now), 3, *place, 90, 90, _clamp_int(speed * 100, 0, 65534), course, 16, place[2], 900, 1780, 250
+            self._usec(now), fix, *place, 90, 90, _clamp_int(speed * 100, 0, 65534), course, satellites, place[2], 900, 1780, 250
         )
 
     def _gps_global_origin(self, now: Snapshot) -> Message:

@@ -39,7 +39,8 @@ ALPHA_LP = 33  # 3, rad/s2, low-passed
 BODY_Z_SP = 36  # 3, wanted thrust direction, world
 THRUST_SP = 39  # wanted collective thrust, normalised
 PHASE = 40  # steps since the outer loop ran
-STATE_SIZE = 41
+YAW_TORQUE = 41  # low-passed yaw torque, normalised
+STATE_SIZE = 42
 
 _OUTER_STEPS = 2  # PX4's position loop runs on the estimator's output, about half the rate of its rate loop
 _TAKEOFF_MIN_M_S = 0.05  # on the ground, slower climb setpoints leave the motors idle
@@ -47,6 +48,7 @@ _XY_THRUST_MARGIN = 0.3  # MPC_THR_XY_MARG
 _RATE_INT_LIMIT = 0.3  # MC_RR_INT_LIM
 _RATE_INT_FADE_RAD_S = math.radians(400.0)  # PX4 fades the rate integrator out towards this error
 _YAW_OVERSHOOT = 0.15  # yaw may ask this much above full thrust, paid by the collective
+_HEIGHT_RATE_M_S = 0.7  # MPC_LAND_SPEED: from this vertical setpoint on, PX4 flies on the height's derivative alone
 _ROLL_PITCH_MIX = math.sqrt(0.5)  # PX4's normalised quad X effectiveness
 
 Row = NDArray[np.float64]
@@ -77,6 +79,12 @@ def reset_state(state: Row, params: Row, x_m: float, y_m: float, z_m: float, yaw
     else:
         state[POS + 2] = 0.0
         state[LANDED] = 1.0
+
+
+@njit(cache=True)
+def height_rate_share(climb_sp: float) -> float:
+    """How much of the vertical velocity flown on is the derivative of the estimated height, not the estimated velocity."""
+    return float(min(abs(climb_sp) / _HEIGHT_RATE_M_S, 1.0))
 
 
 @njit(cache=True, error_model="numpy")
@@ -150,6 +158,7 @@ def _reset_controller(state: Row) -> None:
     state[ALPHA_LP : ALPHA_LP + 3] = 0.0
     state[BODY_Z_SP], state[BODY_Z_SP + 1], state[BODY_Z_SP + 2] = 0.0, 0.0, 1.0
     state[THRUST_SP] = 0.0
+    state[YAW_TORQUE] = 0.0
     state[PHASE] = 0.0
 
 
@@ -168,7 +177,8 @@ def _velocity_loop(state: Row, params: Row, velocity_sp: Row, estimate_error: Ro
     climb = min(params[vp.VEL_MAX_UP], max(-params[vp.VEL_MAX_DOWN], velocity_sp[2]))
     error_x = scale * velocity_sp[0] - state[VEL] - estimate_error[0]
     error_y = scale * velocity_sp[1] - state[VEL + 1] - estimate_error[1]
-    error_z = climb - state[VEL + 2] - estimate_error[2]
+    # the derivative of the height has no such slow error
+    error_z = climb - state[VEL + 2] - (1.0 - height_rate_share(velocity_sp[2])) * estimate_error[2]
     if state[LANDED] > 0.0:
         error_x, error_y = 0.0, 0.0
     acc_x = params[vp.VEL_P_XY] * error_x + state[VEL_INT] - params[vp.VEL_D_XY] * state[ACC_LP]
@@ -232,10 +242,14 @@ def _attitude_and_rate_loops(state: Row, params: Row, yaw_rate_sp: float) -> tup
     for i in range(3):
         state[ALPHA_LP + i] += gain * (state[ALPHA + i] - state[ALPHA_LP + i])
     p_xy, i_xy, d_xy = params[vp.RATE_P_XY], params[vp.RATE_I_XY], params[vp.RATE_D_XY]
+    p_z, i_z, d_z = params[vp.RATE_P_Z], params[vp.RATE_I_Z], params[vp.RATE_D_Z]
+    yaw_torque = _rate_pid(state, 2, min(limit_z, max(-limit_z, rate_z)), p_z, i_z, d_z)
+    smoothing = STEP_S / (STEP_S + 1.0 / (2.0 * math.pi * params[vp.YAW_TORQUE_CUTOFF_HZ]))
+    state[YAW_TORQUE] += smoothing * (yaw_torque - state[YAW_TORQUE])
     return (
         _rate_pid(state, 0, min(limit_xy, max(-limit_xy, rate_x)), p_xy, i_xy, d_xy),
         _rate_pid(state, 1, min(limit_xy, max(-limit_xy, rate_y)), p_xy, i_xy, d_xy),
-        _rate_pid(state, 2, min(limit_z, max(-limit_z, rate_z)), params[vp.RATE_P_Z], params[vp.RATE_I_Z], params[vp.RATE_D_Z]),
+        state[YAW_TORQUE],
     )
 
 

@@ -21,9 +21,9 @@ GRAVITY_M_S2 = 9.80665
     VEL_MAX_XY, VEL_MAX_UP, VEL_MAX_DOWN, ACC_CUTOFF_HZ,
     TAN_TILT_MAX, HOVER_THRUST, THRUST_MIN,
     ATT_P_ROLL, ATT_P_PITCH, ATT_P_YAW, YAW_SETPOINT_AGE, RATE_MAX_XY, RATE_MAX_Z,
-    RATE_P_XY, RATE_I_XY, RATE_D_XY, RATE_P_Z, RATE_I_Z, RATE_D_Z, DGYRO_CUTOFF_HZ,
-) = range(38)  # fmt: skip
-PARAM_SIZE = 38
+    RATE_P_XY, RATE_I_XY, RATE_D_XY, RATE_P_Z, RATE_I_Z, RATE_D_Z, DGYRO_CUTOFF_HZ, YAW_TORQUE_CUTOFF_HZ,
+) = range(39)  # fmt: skip
+PARAM_SIZE = 39
 
 # What `randomised` spreads: the vehicle fully, the autopilot's gains by half (they are tuned to the vehicle, roughly).
 # The rest are limits and filters of the autopilot, known exactly.
@@ -84,6 +84,7 @@ class VehicleParams:
     rate_i_yaw: float = 0.1
     rate_d_yaw: float = 0.0
     angular_acceleration_cutoff_hz: float = 30.0  # IMU_DGYRO_CUTOFF
+    yaw_torque_cutoff_hz: float = 2.0  # MC_YAW_TQ_CUTOFF
 
     def __post_init__(self) -> None:
         for name, value in self._values().items():
@@ -147,3 +148,5 @@ SIH_QUADX = VehicleParams(
     attitude_p_roll=4.0,
     attitude_p_pitch=4.0,
 )
+
+PROFILES: dict[str, VehicleParams] = {"iris": IRIS, "sih_quadx": SIH_QUADX}

@@ -35,6 +35,9 @@ class ScipSession:
         self._reported = (0, 0)
         self._pending: deque[scip.Reply] = deque(maxlen=_DRAINED_REPLIES)
         self._parameters: scip.ScipParameters | None = None
+        self._mounting: Mounting | None = None
+        self._sent = b""
+        self._newest_s = self._deadline_s = -math.inf
 
     @property
     def clock_uncertainty_s(self) -> float:
@@ -66,24 +69,37 @@ class ScipSession:
 
     def scans(self) -> Iterator[LidarScan]:
         """Start the stream and give its scans until the driver stops. Raises when the device stalls or the link breaks."""
+        self.begin()
+        while not self._stop.is_set():
+            scan = self.poll()
+            if scan is not None:
+                yield scan
+
+    def begin(self) -> None:
+        """Ask for the stream."""
         parameters = self._parameters
         if parameters is None:
             raise scip.ScipError("the session is not open")
-        mounting = Mounting(self._config, parameters.angle_min_rad, parameters.angle_increment_rad, parameters.beams)
-        sent = scip.stream_request(parameters.first_step, parameters.last_step)
-        self._transport.write(sent, self._config.reply_timeout_s)
-        newest_s = -math.inf
-        deadline_s = self._now() + self._config.stall_timeout_s
-        while not self._stop.is_set():
-            scan = self._read_scan(sent, parameters, mounting)
-            if scan is not None and scan.time_s > newest_s:
-                newest_s = scan.time_s
-                deadline_s = self._now() + self._config.stall_timeout_s
-                yield scan
-            elif scan is not None:
-                self._count_bad(0, 1)  # not newer than the last: its clock or its data stands still
-            if self._now() > deadline_s:
-                raise TransportError(f"the LiDAR sent no good scan for {self._config.stall_timeout_s:g} s")
+        self._mounting = Mounting(self._config, parameters.angle_min_rad, parameters.angle_increment_rad, parameters.beams)
+        self._sent = scip.stream_request(parameters.first_step, parameters.last_step)
+        self._transport.write(self._sent, self._config.reply_timeout_s)
+        self._newest_s = -math.inf
+        self._deadline_s = self._now() + self._config.stall_timeout_s
+
+    def poll(self) -> LidarScan | None:
+        """The next scan, None when none came within a moment. Raises when the device stalls or the link breaks."""
+        if self._parameters is None or self._mounting is None:
+            raise scip.ScipError("the stream was not asked for")
+        scan = self._read_scan(self._sent, self._parameters, self._mounting)
+        if scan is not None and scan.time_s > self._newest_s:
+            self._newest_s = scan.time_s
+            self._deadline_s = self._now() + self._config.stall_timeout_s
+            return scan
+        if scan is not None:
+            self._count_bad(0, 1)  # not newer than the last: its clock or its data stands still
+        if self._now() > self._deadline_s:
+            raise TransportError(f"the LiDAR sent no good scan for {self._config.stall_timeout_s:g} s")
+        return None
 
     def _read_scan(self, sent: bytes, parameters: scip.ScipParameters, mounting: Mounting) -> LidarScan | None:
         """The newest good scan of what has arrived; None when there is none yet."""

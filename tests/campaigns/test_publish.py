@@ -13,12 +13,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_readme_and_model_cards_are_what_the_results_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for folder in ("policies", "results"):
+    for folder in ("policies", "results", "docs"):
         shutil.copytree(ROOT / folder, tmp_path / folder)
     shutil.copy(ROOT / "README.md", tmp_path)
     monkeypatch.chdir(tmp_path)
     publish()
-    for path in [Path("README.md"), *Path("policies").glob("*.md")]:
+    for path in [Path("README.md"), Path("docs/safety.md"), *Path("policies").glob("*.md")]:
         assert path.read_text() == (ROOT / path).read_text(), f"{path} is out of date: run python -m campaigns.publish"
 
 

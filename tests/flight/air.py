@@ -29,7 +29,7 @@ from sim_gateway.scene import World
 from sim_gateway.sticks import Sticks
 from sim_gateway.telemetry import Telemetry
 
-FLY = (245, 191)
+FLY = (245, 191), (245, 192)  # MAVSDK in `fly`, and the guard
 # unequal walls near enough for 4 m of range: a mirrored or turned scan cannot look like the right one
 WALLS = np.array(
     [
@@ -113,7 +113,7 @@ class Air:
     def received(self, since_s: float = -math.inf) -> list[tuple[float, str]]:
         """What `fly` sent that moves, arms or configures, as it arrived at the vehicle: (vehicle time, what)."""
         log = tuple(self.gateway.server.wire_log)
-        return [(item.time_s, item.what) for item in log if item.sender == FLY and item.time_s > since_s]
+        return [(item.time_s, item.what) for item in log if item.sender in FLY and item.time_s > since_s]
 
     def put_back(self) -> None:
         """Motors off, back on the start, in Hold, estimate settled, no faults."""

@@ -89,6 +89,7 @@ def test_arms_streams_and_engages_offboard(link: VehicleLink) -> None:
             assert time.monotonic() < deadline
             time.sleep(0.3)
     sent = link.setpoints_sent
+    link.open_stream()
     try:
         for _ in range(20):
             link.send_velocity(still, NORTH)

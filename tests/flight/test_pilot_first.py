@@ -19,6 +19,7 @@ from air import Air, open_air, quiet
 
 from flight.authority import Authority, ControlLostError
 from flight.errors import VehicleCommandError
+from flight.lidar.driver import LidarDriver
 from flight.offboard import Ending, OffboardFlight
 from flight.px4 import FlightMode
 from flight.session import FlightSession
@@ -27,7 +28,7 @@ from flight.tick import Pilot
 from policy_export.runner import PolicyRunner
 from safety.filter import SafetyFilter
 from safety.frames import CorridorFrame, CorridorVector, NedVector
-from safety.messages import SafeCommand
+from safety.messages import LidarScan, SafeCommand
 
 pytestmark = pytest.mark.realtime
 
@@ -252,6 +253,8 @@ def px4_failsafe(air: Air) -> None:
 
 
 _BRAKING = threading.Event()
+_HANGS = threading.Event()
+HANG_S = 1.5
 TAKEOVERS: tuple[Story, ...] = (
     while_arming_to_takeoff,
     during_takeoff,
@@ -325,6 +328,36 @@ def test_undisturbed_it_holds_and_lands(air: Air) -> None:
     flown = engagement(air, nobody)
     assert flown.landed is True, flown
     assert [mode for mode in flown.modes if mode in ("OFFBOARD", "AUTO.LAND")] == ["OFFBOARD", "AUTO.LAND"]
+
+
+@pytest.fixture
+def hanging(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop hangs for a while once `_HANGS` is set."""
+    latest = LidarDriver.latest
+    _HANGS.clear()
+
+    def slow(self: LidarDriver) -> LidarScan | None:
+        if _HANGS.is_set():
+            _HANGS.clear()
+            time.sleep(HANG_S)
+        return latest(self)
+
+    monkeypatch.setattr(LidarDriver, "latest", slow)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.3], ids=["before the guard brakes", "while the guard brakes"])
+@pytest.mark.usefixtures("hanging")
+def test_a_takeover_while_the_loop_hangs_is_not_followed_by_braking(air: Air, delay_s: float) -> None:
+    def story(air: Air) -> None:
+        in_offboard(air)
+        _HANGS.set()
+        time.sleep(delay_s)
+        take(air, lambda: air.station.mode(*HOLD), mode_is(air, LOITER))
+
+    flown = engagement(air, story)
+    assert flown.late == []
+    assert flown.ending.outcome == "pilot_took_over", flown
+    assert flown.ending.in_control is False
 
 
 def test_the_link_refuses_everything_after_the_loss(air: Air) -> None:

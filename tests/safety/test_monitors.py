@@ -23,7 +23,7 @@ def flying(ticks=6, **changes):
     safety = SafetyFilter(config(**changes))
     for k in range(ticks):
         time_s = 0.05 * k
-        sent, verdict = safety.apply(command(0.5), state(time_s=time_s), scan(time_s=time_s), time_s)
+        sent, verdict = safety.apply(command(0.5), state(5.0 + 0.01 * k, time_s=time_s), scan(time_s=time_s), time_s)
         assert verdict.fault is None
         assert sent.velocity.x == 0.5
     return safety, 0.05 * ticks
@@ -31,7 +31,7 @@ def flying(ticks=6, **changes):
 
 def nxt(time_s, **parts):
     """The next tick's arguments, all healthy but for `parts`."""
-    healthy = {"command": command(0.5), "state": state(time_s=time_s), "scan": scan(time_s=time_s), "now_s": time_s}
+    healthy = {"command": command(0.5), "state": state(5.2, time_s=time_s), "scan": scan(time_s=time_s), "now_s": time_s}
     return healthy | parts
 
 

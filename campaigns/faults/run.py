@@ -1,0 +1,43 @@
+"""One case of the campaign: an entry of the catalogue in a scene with a seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from campaigns.faults.catalogue import Entry
+from campaigns.faults.oracle import Verdict, judge
+from campaigns.faults.scenes import SCENES
+from campaigns.faults.stage import Stage, Trace, felt_s
+from flight.mission import Mission
+from policy_export.runner import PolicyRunner
+from safety.filter import SafetyFilter
+
+OBSERVED_S = 4.5
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What is run."""
+
+    entry: str
+    scene: str
+    seed: int
+
+
+def play(
+    entry: Entry,
+    scene: str,
+    seed: int,
+    mission: Mission,
+    runner: PolicyRunner,
+    make_filter: Callable[..., SafetyFilter] = SafetyFilter,
+) -> tuple[Trace, Verdict]:
+    """Fly it and judge it."""
+    duration_s = max(OBSERVED_S, entry.felt_after_s + OBSERVED_S)
+    stage = Stage(SCENES[scene], mission, runner, seed, entry.faults, duration_s=duration_s, make_filter=make_filter)
+    if entry.inject is not None:
+        entry.inject(stage)
+    trace = stage.play()
+    trace.felt_s = felt_s(stage, entry.felt_with) + entry.felt_after_s
+    return trace, judge(trace, entry.expects(scene))

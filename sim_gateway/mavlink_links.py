@@ -1,0 +1,229 @@
+"""The vehicle's side of a MAVLink link: what it streams, whom it answers, what arrives. UDP on loopback, or in memory.
+
+Nothing blocks; everything that could grow is bounded. Link faults act here, on whole messages.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import math
+import socket
+import struct
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import development as mav
+
+from sim_gateway.autopilot import StatusText
+from sim_gateway.link_faults import Garbage, LinkFaults
+from sim_gateway.telemetry import COMPONENT_ID, STREAM_RATES_HZ, SYSTEM_ID, Message
+
+LOOPBACK = "127.0.0.1"
+_MAX_DATAGRAM = 4096
+_DATAGRAMS_PER_POLL = 100  # more wait in the socket's own, bounded, buffer
+_PEERS_PER_LINK = 8
+_PEER_TIMEOUT_S = 10.0
+_GCS_TIMEOUT_S = 5.0
+_TEXT_CHUNK = 50
+_MIN_INTERVAL_US = 1000.0
+_MEMORY_MESSAGES = 100_000
+
+_log = logging.getLogger("sim_gateway.mavlink")
+
+
+class PortInUseError(OSError):
+    """A port the gateway needs is taken; the message names it."""
+
+
+@dataclass(slots=True)
+class _Stream:
+    interval_s: float
+    due_s: float
+
+
+def _bind(port: int, purpose: str) -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.setblocking(False)
+    try:
+        sock.bind((LOOPBACK, port))
+    except OSError as error:
+        sock.close()
+        reason = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
+        raise PortInUseError(f"UDP port {port} ({purpose}) {reason}") from error
+    return sock
+
+
+class MavlinkLink(ABC):
+    """One link: its streams and its faults. What carries the messages is in the classes below."""
+
+    def __init__(self, name: str, column: int, now_s: Callable[[], float]) -> None:
+        self.name = name
+        self.faults: LinkFaults | None = None
+        self._now_s = now_s
+        self._defaults = {n: 1.0 / rates[column] for n, rates in STREAM_RATES_HZ.items() if rates[column] > 0}
+        self.streams = {name: _Stream(interval, 0.0) for name, interval in self._defaults.items()}
+        self.parameter_queue: deque[str] = deque()
+        self.gcs_heard_s = -math.inf
+        self._text_id = 0
+
+    @property
+    def has_gcs(self) -> bool:
+        """Whether a ground station's heartbeat came lately: only then PX4 sends STATUSTEXT here."""
+        return self._now_s() - self.gcs_heard_s < _GCS_TIMEOUT_S
+
+    def close(self) -> None:  # noqa: B027  (most links hold nothing)
+        """Let go of what carries the messages."""
+
+    # ---- out
+
+    def send(self, message: Message) -> None:
+        """Send to everyone on the link, through its faults."""
+        if self.faults is None:
+            self._transmit(message)
+            return
+        for leaving in self.faults.out(message, self._now_s()):
+            self._transmit(leaving)
+
+    def flush(self) -> None:
+        """Send what link faults have kept back until now, or add by themselves."""
+        if self.faults is not None:
+            for leaving in self.faults.due_out(self._now_s()):
+                self._transmit(leaving)
+
+    @abstractmethod
+    def _transmit(self, message: Message | Garbage) -> None:
+        """Put one message on the wire."""
+
+    def send_text(self, text: StatusText) -> None:
+        """STATUSTEXT in pieces of 50 characters; like PX4's, a text that fills its last piece is followed by an empty one."""
+        data = text.text.encode("ascii", "replace")
+        if len(data) < _TEXT_CHUNK:
+            self.send(mav.MAVLink_statustext_message(text.severity, data))
+            return
+        self._text_id = self._text_id % 0xFFFF + 1
+        for chunk in range(min(len(data) // _TEXT_CHUNK + 1, 255)):
+            piece = data[chunk * _TEXT_CHUNK : (chunk + 1) * _TEXT_CHUNK]
+            self.send(mav.MAVLink_statustext_message(text.severity, piece, self._text_id, chunk))
+
+    def set_interval(self, name: str, interval_us: float) -> None:
+        """Stream `name` at this interval: 0 its default, negative off. Faster than 1 kHz is not possible."""
+        interval_s = self._defaults.get(name, -1.0) if interval_us == 0 else max(interval_us, _MIN_INTERVAL_US) * 1e-6
+        if interval_us < 0 or interval_s < 0:
+            self.streams.pop(name, None)
+        else:
+            self.streams[name] = _Stream(interval_s, self._now_s())
+
+    def interval_us(self, name: str) -> int:
+        """The interval in force; -1 when the message is not streamed."""
+        stream = self.streams.get(name)
+        return -1 if stream is None else round(stream.interval_s * 1e6)
+
+    def due(self, available: Callable[[str], bool]) -> list[str]:
+        """Names of the messages whose time has come. A stream that fell behind skips what it missed."""
+        now_s, names = self._now_s(), []
+        for name, stream in self.streams.items():
+            if now_s >= stream.due_s - 1e-9 and available(name):
+                names.append(name)
+                behind = now_s - stream.due_s > stream.interval_s
+                stream.due_s = now_s + stream.interval_s if behind else stream.due_s + stream.interval_s
+        return names
+
+    # ---- in
+
+    def receive(self) -> list[Message]:
+        """The valid messages that have arrived, through the link's faults."""
+        arrived = self._fetch()
+        return arrived if self.faults is None else self.faults.into(arrived, self._now_s())
+
+    @abstractmethod
+    def _fetch(self) -> list[Message]:
+        """The valid messages that have come over the wire."""
+
+
+class UdpLink(MavlinkLink):
+    """A UDP link on loopback: to its default client port and to every loopback address that has spoken to it lately."""
+
+    def __init__(self, name: str, own_port: int, client_port: int, column: int, now_s: Callable[[], float]) -> None:
+        super().__init__(name, column, now_s)
+        self.socket = _bind(own_port, f"{name} link")
+        self._client = (LOOPBACK, client_port)
+        self._peers: dict[tuple[str, int], float] = {}
+        self._packer = mav.MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=COMPONENT_ID)
+
+    def close(self) -> None:
+        """Free the port."""
+        self.socket.close()
+
+    def _transmit(self, message: Message | Garbage) -> None:
+        """To all peers; a full or unreachable socket loses the message, as UDP does."""
+        try:
+            data = message.data if isinstance(message, Garbage) else message.pack(self._packer)
+        except (struct.error, OverflowError, ValueError) as error:
+            _log.error("message %s has a value outside its field: %s", message.get_type(), error)
+            return
+        for peer in (self._client, *self._peers):
+            try:
+                self.socket.sendto(data, peer)
+            except OSError as error:
+                _log.debug("message to %s lost: %s", peer, error)
+
+    def _fetch(self) -> list[Message]:
+        """The valid messages that have arrived; bad bytes, wrong checksums and foreign hosts are dropped."""
+        messages: list[Message] = []
+        self._forget_silent_peers()
+        for _ in range(_DATAGRAMS_PER_POLL):
+            try:
+                data, peer = self.socket.recvfrom(_MAX_DATAGRAM)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                _log.debug("receiving on the %s link: %s", self.name, error)
+                continue
+            found = _parse(data)
+            if found:
+                self._remember(peer)
+            messages.extend(found)
+        return messages
+
+    def _remember(self, peer: tuple[str, int]) -> None:
+        """Answer a client on another port too, for as long as it speaks."""
+        known = peer in self._peers or len(self._peers) < _PEERS_PER_LINK
+        if peer != self._client and known and peer[0].startswith("127."):
+            self._peers[peer] = self._now_s()
+
+    def _forget_silent_peers(self) -> None:
+        if self._peers:
+            oldest_s = self._now_s() - _PEER_TIMEOUT_S
+            self._peers = {peer: heard_s for peer, heard_s in self._peers.items() if heard_s >= oldest_s}
+
+
+class MemoryLink(MavlinkLink):
+    """A link inside this process, for lockstep: the client takes from `outbox` and puts packed messages into `inbox`."""
+
+    def __init__(self, name: str, column: int, now_s: Callable[[], float]) -> None:
+        super().__init__(name, column, now_s)
+        self.outbox: deque[Message | Garbage] = deque(maxlen=_MEMORY_MESSAGES)
+        self.inbox: deque[Message] = deque(maxlen=_MEMORY_MESSAGES)
+
+    def _transmit(self, message: Message | Garbage) -> None:
+        self.outbox.append(message)
+
+    def _fetch(self) -> list[Message]:
+        arrived = list(self.inbox)
+        self.inbox.clear()
+        return arrived
+
+
+def _parse(data: bytes) -> list[Message]:
+    """Messages of one datagram. A fresh parser each time: a truncated frame cannot swallow the next datagram."""
+    parser = mav.MAVLink(None)
+    parser.robust_parsing = True
+    try:
+        found = parser.parse_buffer(data) or []
+    except (mav.MAVError, struct.error, ValueError, IndexError) as error:
+        _log.debug("datagram dropped: %s", error)
+        return []
+    return [message for message in found if message.get_type() != "BAD_DATA" and not message.get_type().startswith("UNKNOWN")]

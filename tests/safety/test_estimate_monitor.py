@@ -1,0 +1,186 @@
+"""What the estimate must not do: every limit met exactly, and passed by a little."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safety_plant import state
+
+from safety.estimate_monitor import EstimateMonitor
+from safety.frames import CorridorVector
+from safety.messages import Health
+from safety.monitor_config import MonitorConfig
+
+C = MonitorConfig()
+UNKNOWN = Health()
+STEP = 0.0625  # exact in binary, so that limits can be met exactly
+
+
+def rules(states, healths=None, commanded=0.0, config=C):
+    """Rules of each sample of a run."""
+    monitor, result = EstimateMonitor(config), []
+    for k, sample in enumerate(states):
+        found = []
+        monitor.judge(sample, healths[k] if healths else UNKNOWN, commanded, sample.time_s, found)
+        result.append([item.rule for item in found])
+    return result
+
+
+def cruise(ticks, v=(0.5, 0.0, 0.0), shift=(0.0, 0.0, 0.0), at=None, step_s=STEP, **parts):
+    """A flight at constant velocity; from tick `at` on displaced by `shift`."""
+    result = []
+    for k in range(ticks):
+        t = k * step_s
+        moved = [v[i] * t + (shift[i] if at is not None and k >= at else 0.0) for i in range(3)]
+        result.append(state(5.0 + moved[0], moved[1], 2.0 + moved[2], v=v, time_s=t, **parts))
+    return result
+
+
+LIMIT = C.position_jump_m + C.velocity_mismatch_m_s * STEP
+
+
+@pytest.mark.parametrize("axis", [(1, 0), (0, -1), (0.6, 0.8)])
+def test_jump_limit_is_exact(axis):
+    """E1, in any horizontal direction: the limit is still accepted, a little more is a jump, once."""
+    just, more = LIMIT - 1e-9, LIMIT + 1e-6
+    assert not any(rules(cruise(8, shift=(axis[0] * just, axis[1] * just, 0), at=5)))
+    assert rules(cruise(8, shift=(axis[0] * more, axis[1] * more, 0), at=5)) == [[]] * 5 + [["estimate_jump"]] + [[]] * 2
+
+
+def test_jump_allowance_grows_with_the_time_between_samples():
+    """After a gap of 0.2 s more noise is natural than after one tick."""
+    size = C.position_jump_m + 0.2 * C.velocity_mismatch_m_s - 1e-6
+    assert not any(rules(cruise(3, shift=(size, 0, 0), at=2, step_s=0.2)))
+    assert any(rules(cruise(3, shift=(size, 0, 0), at=2, step_s=0.1)))
+
+
+def test_a_second_jump_soon_is_worse():
+    """E1: a jump and back within 5 s is HOLD; later it is a first one again."""
+    there = cruise(4, shift=(1, 0, 0), at=2)
+    back = state(5.0 + 0.5 * 4 * STEP, v=(0.5, 0, 0), time_s=4 * STEP)
+    assert rules([*there, back])[-1] == ["estimate_jump_again"]
+    long = [*cruise(160, shift=(1, 0, 0), at=2), state(5.0 + 0.5 * 160 * STEP, v=(0.5, 0, 0), time_s=160 * STEP)]
+    assert rules(long)[-1] == ["estimate_jump"]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_altitude_jump_limit_is_exact(sign):
+    limit = C.altitude_jump_m + C.velocity_mismatch_m_s * STEP
+    assert not any(rules(cruise(8, shift=(0, 0, sign * (limit - 1e-9)), at=5)))
+    assert rules(cruise(8, shift=(0, 0, sign * (limit + 1e-6)), at=5))[5] == ["altitude_jump"]
+
+
+def test_reset_counter():
+    """E8: a change is named at once, also when the position happens to stay; unknown counters say nothing."""
+
+    def counted(values):
+        return [dataclasses.replace(s, reset_counter=c) for s, c in zip(cruise(len(values)), values, strict=True)]
+
+    assert rules(counted([3, 3, 4, 4, 3])) == [[], [], ["estimate_reset"], [], ["estimate_reset"]]
+    assert rules(counted([255, 0])) == [[], ["estimate_reset"]]
+    assert not any(rules(counted([None, 3, 3, None, 4])))
+
+
+def test_reset_with_a_jump_is_both_and_starts_anew():
+    jumped = [dataclasses.replace(s, reset_counter=int(k >= 3)) for k, s in enumerate(cruise(12, shift=(2, 0, 0), at=3))]
+    assert rules(jumped) == [[]] * 3 + [["estimate_reset", "estimate_jump"]] + [[]] * 8
+
+
+def drifting(rate, ticks=8):
+    """The velocity says 0.5 m/s, the position moves at 0.5 + rate."""
+    return [state(5.0 + (0.5 + rate) * k * STEP, v=(0.5, 0, 0), time_s=k * STEP) for k in range(ticks)]
+
+
+def test_velocity_mismatch_needs_the_whole_window_and_the_limit():
+    """E6: 7 samples of 62.5 ms are the first window of at least 0.4 s."""
+    assert not any(rules(drifting(C.velocity_mismatch_m_s - 1e-6)))
+    assert rules(drifting(C.velocity_mismatch_m_s + 1e-6)) == [[]] * 7 + [["velocity_mismatch"]]
+    assert rules(drifting(-C.velocity_mismatch_m_s - 1e-6))[7] == ["velocity_mismatch"]
+
+
+def test_velocity_that_turns_its_sign_is_seen_in_time():
+    """E6: flying at 1 m/s while the estimate says -1 m/s, at 20 Hz: within the bound."""
+    good = cruise(20, v=(1.0, 0, 0), step_s=0.05)
+    bad = [state(5.0 + 0.05 * k, v=(-1.0, 0, 0), time_s=0.05 * k) for k in range(20, 40)]
+    first = next(k for k, found in enumerate(rules(good + bad)) if found)
+    assert 0.05 * (first - 20) <= 0.35
+
+
+@pytest.mark.parametrize("over", [-1e-6, 1e-6])
+def test_vertical_mismatch_has_the_same_limit(over):
+    climb = [state(z=2.0 + (C.velocity_mismatch_m_s + over) * k * STEP, time_s=k * STEP) for k in range(8)]
+    assert any(rules(climb)) == (over > 0)
+
+
+def standing(ticks, step_s=0.05):
+    return [state(v=(0.2, 0, 0), time_s=k * step_s) for k in range(ticks)]
+
+
+def test_frozen_estimate_while_commanded():
+    """E2: at 20 Hz 0.2 s is accepted, the fifth repeat is not; slower commands and any new bit clear it."""
+    assert rules(standing(7), commanded=0.3) == [[]] * 5 + [["estimate_frozen"]] * 2
+    assert not any(rules(standing(20), commanded=0.29))
+    moved = standing(20)
+    moved[4] = dataclasses.replace(moved[4], velocity=CorridorVector(0.2, 1e-12, 0.0))
+    assert rules(moved, commanded=0.5)[:9] == [[]] * 9 or rules(moved, commanded=0.5)[9] == []
+    assert rules(moved, commanded=0.5)[11] == ["estimate_frozen"]
+
+
+def test_the_same_sample_twice_is_neither_frozen_nor_a_jump():
+    one = state(v=(0.2, 0, 0), time_s=1.0)
+    assert not any(rules([one] * 20, commanded=1.0))
+
+
+@pytest.mark.parametrize(
+    ("roll", "pitch", "rule"),
+    [
+        (C.tilt_rad - 1e-9, 0, None), (0, -C.tilt_rad - 1e-6, "tilt"), (C.tumbling_rad - 1e-6, 0, "tilt"),
+        (0, C.tumbling_rad + 1e-6, "tumbling"), (math.pi, 0, "tumbling"), (0.8, 0.8, "tilt"), (0.6, 0.6, None),
+    ],
+)  # fmt: skip
+def test_tilt_limits_are_exact(roll, pitch, rule):
+    """V9: both angles together make the tilt."""
+    assert rules([state(roll=roll, pitch=pitch)]) == [[rule] if rule else []]
+
+
+def test_what_the_estimator_says_of_itself():
+    """E11 at once; E5 when it lasts longer than a second; unknown accuses nobody."""
+    ticks = cruise(25)
+    assert rules(ticks[:2], [Health(estimate_valid=True), Health(estimate_valid=False)]) == [[], ["estimate_invalid"]]
+    poor = rules(ticks, [Health(accuracy_m=C.accuracy_m + 1e-9)] * 25)
+    assert poor == [[]] * 17 + [["estimate_inaccurate"]] * 8
+    assert not any(rules(ticks, [Health(accuracy_m=C.accuracy_m)] * 25))
+    assert not any(rules(ticks, [Health(accuracy_m=2.0 if k % 16 else math.nan) for k in range(25)]))
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.tuples(*[st.floats(-3.0, 3.0)] * 3), min_size=2, max_size=40),
+    st.tuples(*[st.floats(-0.015, 0.015)] * 3),
+)
+def test_consistent_motion_is_never_accused(accelerations, bias):
+    """Any motion with bounded acceleration whose velocity is off by a centimetre per second."""
+    p, v, states = [5.0, 0.0, 2.0], [0.0, 0.0, 0.0], []
+    for k, a in enumerate(accelerations):
+        states.append(state(*p, v=tuple(v[i] + bias[i] for i in range(3)), time_s=0.05 * k))
+        p = [p[i] + v[i] * 0.05 + a[i] * 0.00125 for i in range(3)]
+        v = [v[i] + a[i] * 0.05 for i in range(3)]
+    assert not any(rules(states, commanded=0.0))
+
+
+@settings(deadline=None)
+@given(st.floats(0.36, 50.0), st.floats(0, 2 * math.pi), st.floats(-1.2, 1.2), st.floats(-1.2, 1.2))
+def test_any_larger_step_is_a_jump(size, angle, vx, vy):
+    shift = (size * math.cos(angle), size * math.sin(angle), 0.0)
+    assert rules(cruise(4, v=(vx, vy, 0), shift=shift, at=3))[3] == ["estimate_jump"]
+
+
+@settings(deadline=None)
+@given(st.integers(0, 255), st.integers(0, 255))
+def test_reset_is_seen_if_and_only_if_the_counter_changed(a, b):
+    pair = [dataclasses.replace(s, reset_counter=c) for s, c in zip(cruise(2), (a, b), strict=True)]
+    assert (rules(pair)[1] == ["estimate_reset"]) == (a != b)
