@@ -30,6 +30,7 @@ from sim_gateway.simulation import Motion, Scan, Simulation, WindConfig, step_at
 from sim_gateway.vehicle import STEP_S
 
 TICK_S = 0.05
+_OVERRULED = Health(overruled=True, inference_s=0.0)  # zero was sent last; the computer's own times are not judged here
 BRAKE_AFTER_GOAL_S = 1.0
 """As `fly` does on arrival, before it asks the autopilot to hold."""
 SUCCESS_RADIUS_M = 0.3
@@ -106,6 +107,7 @@ class LockstepFlight:
         self._scans = 0
         self._take_scan()
         self._watch = _Watch()
+        self._braked = False
 
     def run(self) -> EpisodeResult:
         """Fly until the goal (and one second of braking) or until the time is up; contacts are counted and flown through."""
@@ -126,8 +128,10 @@ class LockstepFlight:
 
     def _tick(self, now_s: float, *, braking: bool) -> TickRecord:
         """Sample, tick, and put the command on its way. Vehicle time stands at `now_s` before and after."""
-        record = self.pilot.tick(self._latest, vehicle_state(self.simulation.estimate(), now_s), now_s)
+        health = _OVERRULED if self._braked else None
+        record = self.pilot.tick(self._latest, vehicle_state(self.simulation.estimate(), now_s), now_s, health)
         self.log.append(record, now_s)
+        self._braked = braking
         self._next = SafeCommand(BRAKE.velocity, 0.0) if braking else record.sent
         return record
 
@@ -157,8 +161,7 @@ class LockstepFlight:
         if self.simulation.contacts and watch.first_contact is None:
             watch.first_contact = self._what_was_hit(truth)
         fence = self.config.safety.fence
-        inside = all(low <= x <= high for low, x, high in zip(fence.min_m, truth.position_m, fence.max_m, strict=True))
-        watch.left_fence = watch.left_fence or not inside
+        watch.left_fence = watch.left_fence or fence.margin_m(*truth.position_m) < 0.0
 
     def _what_was_hit(self, truth: Motion) -> str:
         boxes, fixed = self.simulation.boxes(), len(self.world.static_boxes)

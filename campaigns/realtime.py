@@ -89,10 +89,8 @@ def fence_margin_m(report: dict[str, Any], safety: SafetyConfig) -> float | None
     """Least distance of the vehicle's hull to the fence while the mode was OFFBOARD, by the gateway's truth; None if never."""
     spans = _offboard_spans(report)
     rows = [row for row in report.get("trajectory", {}).get("rows", []) if any(a <= row[0] <= b for a, b in spans)]
-    hull = (safety.vehicle_radius_m, safety.vehicle_radius_m, safety.vehicle_half_height_m)
-    low, high = safety.fence.min_m, safety.fence.max_m
-    margins = [min(row[1 + i] - low[i], high[i] - row[1 + i]) - hull[i] for row in rows for i in range(3)]
-    return min(margins, default=None)
+    hull = (safety.vehicle_radius_m, safety.vehicle_half_height_m)
+    return min((safety.fence.margin_m(row[1], row[2], row[3], *hull) for row in rows), default=None)
 
 
 def _offboard_spans(report: dict[str, Any]) -> list[tuple[float, float]]:

@@ -18,9 +18,11 @@ from dataclasses import dataclass
 
 from flight.checks.facts import Fields
 from flight.errors import VehicleCommandError
+from flight.fence_outline import grown, shrunk
 from flight.link import OWN_COMPONENT_ID, OWN_SYSTEM_ID, VehicleLink
 from flight.preparation import Place
 from safety.config import SafetyConfig
+from safety.fence import Ring
 from safety.frames import CorridorFrame, CorridorVector, NedVector
 
 OVERSHOOT_HORIZONTAL_M, OVERSHOOT_VERTICAL_M = 2.034, 1.568
@@ -28,7 +30,7 @@ OVERSHOOT_SPEED_M_S = 1.82
 OVERSHOOT_SOURCE = "largest overshoot of PX4 v1.17's Hold at its fence: 2.034 m at 1.8 m/s, 1.568 m upwards at 1.4 m/s"
 EARTH_RADIUS_M = 6371000.0  # of PX4's own projection
 FENCE_TYPE = 1  # MAV_MISSION_TYPE_FENCE
-VERTEX_INCLUSION = 5001  # MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION
+VERTEX_INCLUSION, VERTEX_EXCLUSION = 5001, 5002  # MAV_CMD_NAV_FENCE_POLYGON_VERTEX_...
 FRAME_GLOBAL = 0
 ACCEPTED = 0
 DEADLINE_S, ANSWER_S = 10.0, 0.5
@@ -61,53 +63,51 @@ class GeoPoint:
 
 
 @dataclass(frozen=True, slots=True)
-class OuterFence:
-    """PX4's fence for a mission. `corners_ned`: horizontal corners in order; distances from home (the takeoff point), m."""
-
-    corners_ned: tuple[NedVector, ...]
-    max_horizontal_m: float
-    max_vertical_m: float
-
-    def vertices(self, geo: GeoPoint) -> list[LatLonE7]:
-        """The corners as PX4 stores them."""
-        return [geo.of_ned(corner) for corner in self.corners_ned]
-
-
-def outer_fence(safety: SafetyConfig, frame: CorridorFrame, place: Place) -> OuterFence:
-    """The mission's fence, each side moved out by the measured overshoot."""
-    grow = OVERSHOOT_HORIZONTAL_M
-    (x0, y0, _), (x1, y1, top_m) = safety.fence.min_m, safety.fence.max_m
-    corners = [(x0 - grow, y0 - grow), (x1 + grow, y0 - grow), (x1 + grow, y1 + grow), (x0 - grow, y1 + grow)]
-    home_x, home_y = place.takeoff_point
-    return OuterFence(
-        tuple(frame.point_to_ned(CorridorVector(x, y, 0.0)) for x, y in corners),
-        max(math.hypot(x - home_x, y - home_y) for x, y in corners),
-        top_m + OVERSHOOT_VERTICAL_M,
-    )
-
-
-def inner_corners_ned(safety: SafetyConfig, frame: CorridorFrame) -> list[NedVector]:
-    """The mission's own fence, horizontal corners in local NED."""
-    (x0, y0, _), (x1, y1, _) = safety.fence.min_m, safety.fence.max_m
-    return [frame.point_to_ned(CorridorVector(x, y, 0.0)) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
-
-
-def inside(point: NedVector, corners: Sequence[NedVector]) -> bool:
-    """Whether a point lies in a polygon (horizontal, even-odd rule)."""
-    result = False
-    for a, b in zip(corners, (*corners[1:], corners[0]), strict=True):
-        if (a.y > point.y) != (b.y > point.y) and point.x < a.x + (b.x - a.x) * (point.y - a.y) / (b.y - a.y):
-            result = not result
-    return result
-
-
-@dataclass(frozen=True, slots=True)
 class FenceVertex:
     """One stored item: vertices of one polygon follow each other, each with the polygon's number of vertices."""
 
     command: int
     polygon_size: int
     place: LatLonE7
+
+
+@dataclass(frozen=True, slots=True)
+class OuterFence:
+    """PX4's fence for a mission. `corners_ned`, `exclusions_ned`: horizontal corners in order; distances from home, m.
+
+    `too_small`: exclusions of the mission of which nothing is left for PX4; the mission's own fence alone keeps them.
+    """
+
+    corners_ned: tuple[NedVector, ...]
+    exclusions_ned: tuple[tuple[NedVector, ...], ...]
+    too_small: int
+    max_horizontal_m: float
+    max_vertical_m: float
+
+    def items(self, geo: GeoPoint) -> list[FenceVertex]:
+        """The corners as PX4 stores them."""
+        polygons = [(VERTEX_INCLUSION, self.corners_ned), *((VERTEX_EXCLUSION, ring) for ring in self.exclusions_ned)]
+        return [FenceVertex(command, len(ring), geo.of_ned(corner)) for command, ring in polygons for corner in ring]
+
+
+def outer_fence(safety: SafetyConfig, frame: CorridorFrame, place: Place) -> OuterFence:
+    """The mission's fence, moved out by the measured overshoot: the inclusion grown, exclusions shrunk."""
+    fence = safety.fence
+    smaller = [shrunk(ring, OVERSHOOT_HORIZONTAL_M) for ring in fence.exclusion]
+    exclusions = [ring for ring in smaller if ring is not None]
+    outline = grown(fence.polygon, OVERSHOOT_HORIZONTAL_M, MAX_ITEMS - sum(map(len, exclusions)))
+    return OuterFence(
+        ring_to_ned(outline, frame),
+        tuple(ring_to_ned(ring, frame) for ring in exclusions),
+        smaller.count(None),
+        max(math.dist(corner, place.takeoff_point) for corner in outline),
+        fence.high_m[2] + OVERSHOOT_VERTICAL_M,
+    )
+
+
+def ring_to_ned(ring: Ring, frame: CorridorFrame) -> tuple[NedVector, ...]:
+    """Horizontal corners of a polygon in local NED."""
+    return tuple(frame.point_to_ned(CorridorVector(x, y, 0.0)) for x, y in ring)
 
 
 class FenceClient:
@@ -127,19 +127,19 @@ class FenceClient:
 
         return take
 
-    def upload(self, vertices: Sequence[LatLonE7]) -> None:
-        """Replace PX4's fence by one inclusion polygon. Raises `VehicleCommandError` when PX4 does not take it."""
+    def upload(self, items: Sequence[FenceVertex]) -> None:
+        """Replace PX4's fence. Raises `VehicleCommandError` when PX4 does not take it."""
         self._drain()
         deadline = self._clock() + DEADLINE_S
         started = False
-        self._send("MISSION_COUNT", count=len(vertices))
+        self._send("MISSION_COUNT", count=len(items))
         while (left_s := deadline - self._clock()) > 0.0:
             answer = self._next(min(ANSWER_S, left_s))
             if answer is None and not started:
-                self._send("MISSION_COUNT", count=len(vertices))
+                self._send("MISSION_COUNT", count=len(items))
             elif answer is not None and answer[0] in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
                 started = True
-                self._send_vertex(int(answer[1]["seq"]), vertices)
+                self._send_vertex(int(answer[1]["seq"]), items)
             elif answer is not None and answer[0] == "MISSION_ACK":
                 _require_accepted(int(answer[1]["type"]))
                 return
@@ -166,14 +166,15 @@ class FenceClient:
         self._send("MISSION_CLEAR_ALL")
         _require_accepted(int(self._await("MISSION_ACK", lambda: self._send("MISSION_CLEAR_ALL"))["type"]))
 
-    def _send_vertex(self, seq: int, vertices: Sequence[LatLonE7]) -> None:
-        if not 0 <= seq < len(vertices):
-            raise VehicleCommandError(f"PX4 asked for fence vertex {seq} of {len(vertices)}")
-        latitude, longitude = vertices[seq]
-        numbers = {"param1": float(len(vertices)), "param2": 0.0, "param3": 0.0, "param4": 0.0, "z": 0.0}
+    def _send_vertex(self, seq: int, items: Sequence[FenceVertex]) -> None:
+        if not 0 <= seq < len(items):
+            raise VehicleCommandError(f"PX4 asked for fence vertex {seq} of {len(items)}")
+        item = items[seq]
+        latitude, longitude = item.place
+        numbers = {"param1": float(item.polygon_size), "param2": 0.0, "param3": 0.0, "param4": 0.0, "z": 0.0}
         self._send(
             "MISSION_ITEM_INT",
-            seq=seq, frame=FRAME_GLOBAL, command=VERTEX_INCLUSION, current=0, autocontinue=1, x=latitude, y=longitude, **numbers,
+            seq=seq, frame=FRAME_GLOBAL, command=item.command, current=0, autocontinue=1, x=latitude, y=longitude, **numbers,
         )  # fmt: skip
 
     def _send(self, name: str, **fields: float) -> None:

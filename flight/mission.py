@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from flight.errors import MissionError
@@ -25,6 +26,7 @@ from safety.frames import CorridorVector
 from strict_yaml import ConfigError, load_config
 
 SIM = "sim"
+_LESS = "(fence less vehicle, position error and margin)"
 Coordinate = Annotated[float, Field(ge=-10_000.0, le=10_000.0)]
 Seconds = Annotated[float, Field(gt=0.0, le=3600.0)]
 Port = Annotated[int, Field(ge=1, le=65535)]
@@ -181,8 +183,7 @@ class Mission(_Section):
     @classmethod
     def _height_fits(cls, height_m: float, info: ValidationInfo) -> float:
         if "safety" in info.data:
-            low, high = info.data["safety"].keep_in()
-            _raise(_outside("", height_m, low[2], high[2], "change it or widen safety.fence"))
+            _raise(height_problem("", height_m, info.data["safety"], "change it or widen safety.fence"))
         return height_m
 
     @field_validator("goal")
@@ -204,31 +205,31 @@ class Mission(_Section):
 
 def goal_problem(goal: CorridorVector, safety: SafetyConfig) -> str | None:
     """What is wrong with a goal, or None: outside the eroded fence the safety filter would never let it be reached."""
-    low, high = safety.keep_in()
-    for axis, value, lowest, highest in zip("xyz", (goal.x, goal.y, goal.z), low, high, strict=True):
-        problem = _outside(f"goal.position_m {axis} = ", value, lowest, highest, "move the goal or widen safety.fence")
-        if problem is not None:
-            return problem
-    return None
+    advice = "move the goal or widen safety.fence"
+    return _outside("goal.position_m", (goal.x, goal.y), safety, advice) or height_problem(
+        "goal.position_m z = ", goal.z, safety, advice
+    )
 
 
 def takeoff_point_problem(point: tuple[float, float], safety: SafetyConfig) -> str | None:
     """What is wrong with a takeoff point, or None: the vehicle hovers above it, so it must lie in the eroded fence."""
-    low, high = safety.keep_in()
-    for axis, value, lowest, highest in zip("xy", point, low, high, strict=False):
-        problem = _outside(f"frame.takeoff_point_m {axis} = ", value, lowest, highest, "move it or widen safety.fence")
-        if problem is not None:
-            return problem
-    return None
+    return _outside("frame.takeoff_point_m", point, safety, "move it or widen safety.fence")
 
 
-def _outside(what: str, value: float, low: float, high: float, advice: str) -> str | None:
-    if low <= value <= high:
+def height_problem(what: str, z_m: float, safety: SafetyConfig, advice: str) -> str | None:
+    """What is wrong with a height, or None."""
+    low, high = safety.keep_in_z()
+    if low <= z_m <= high:
         return None
-    return (
-        f"{what}{value:g} m is outside the safe part of the fence, {low:.2f} .. {high:.2f} m "
-        f"(fence less vehicle, position error and margin); {advice}"
-    )
+    return f"{what}{z_m:g} m is outside the safe part of the fence, {low:.2f} .. {high:.2f} m {_LESS}; {advice}"
+
+
+def _outside(what: str, point: tuple[float, float], safety: SafetyConfig, advice: str) -> str | None:
+    room_m = float(safety.eroded_fence().room_m(np.array(point)))
+    if room_m >= 0.0:
+        return None
+    x, y = point
+    return f"{what} ({x:g}, {y:g}) m is outside the safe part of the fence by {-room_m:.2f} m {_LESS}; {advice}"
 
 
 def _needs_sim(field: str, info: ValidationInfo) -> None:

@@ -23,6 +23,7 @@ from flight.recording_schema import (
     encode_scan,
     encode_tick,
 )
+from safety.config import Fence
 from safety.frames import CorridorVector
 from safety.messages import LidarScan, VehicleState
 
@@ -203,13 +204,28 @@ class Channels:
             size=messages.Vector3(x=diameter, y=diameter, z=diameter),
             color=messages.Color(r=0.1, g=0.7, b=0.3, a=0.5),
         )
-        fence = header.safety.fence
-        cubes = [self._cube((*fence.min_m, *fence.max_m), messages.Color(r=0.8, g=0.2, b=0.2, a=0.08))]
-        cubes += [self._cube(box, messages.Color(r=0.5, g=0.55, b=0.6, a=0.7)) for box in header.boxes_m or ()]
+        cubes = [self._cube(box, messages.Color(r=0.5, g=0.55, b=0.6, a=0.7)) for box in header.boxes_m or ()]
         entity = messages.SceneEntity(
-            timestamp=self._stamp(at), frame_id=WORLD_FRAME, id="mission", frame_locked=True, cubes=cubes, spheres=[goal]
-        )
+            timestamp=self._stamp(at), frame_id=WORLD_FRAME, id="mission", frame_locked=True, cubes=cubes, spheres=[goal],
+            lines=self._fence_lines(header.safety.fence),
+        )  # fmt: skip
         self._scene.log(messages.SceneUpdate(entities=[entity]), log_time=at)
+
+    def _fence_lines(self, fence: Fence) -> list[Any]:
+        """Each polygon of the fence as a closed line, at its floor and at its ceiling."""
+        messages, red = self._messages, self._messages.Color(r=0.8, g=0.2, b=0.2, a=0.9)
+        pose = self._pose_of(CorridorVector(0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+        return [
+            messages.LinePrimitive(
+                type=messages.LinePrimitiveLineType.LineLoop,
+                pose=pose,
+                thickness=0.04,
+                color=red,
+                points=[messages.Point3(x=x, y=y, z=z) for x, y in ring],
+            )
+            for ring in (fence.polygon, *fence.exclusion)
+            for z in (fence.low_m[2], fence.high_m[2])
+        ]
 
     def _cube(self, box: tuple[float, ...], color: Any) -> Any:
         low, high = box[:3], box[3:]

@@ -106,10 +106,8 @@ def _hits(axes: Axes, hits: NDArray[np.float64]) -> str:
 
 
 def _fence(axes: Axes, run: Run) -> str:
-    low, high = run.corner("fence_m", "min"), run.corner("fence_m", "max")
-    if low is None or high is None:
-        return ""
-    return f'<path class="fence" d="{_rectangle(axes, low[:2], high[:2])}"/>'
+    rings = ["L".join(f"{axes.px(x):.1f} {axes.py(y):.1f}" for x, y in ring) for ring in run.fence_rings()]
+    return "".join(f'<path class="fence" d="M{ring}z"/>' for ring in rings)
 
 
 def _goal(axes: Axes, run: Run) -> str:

@@ -61,6 +61,16 @@ class Run:
         table = _table(value)
         return (float(table[0]), float(table[1]), float(table[2])) if table is not None and table.shape == (3,) else None
 
+    def fence_rings(self) -> list[NDArray[np.float64]]:
+        """Corners [k, 2] of the fence's inclusion polygon, then of each exclusion; empty without a fence in the summary."""
+        fence = self.summary.get("fence_m")
+        low, high = self.corner("fence_m", "min"), self.corner("fence_m", "max")
+        if low is None or high is None or not isinstance(fence, dict):
+            return []
+        box = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
+        tables = [_table(ring) for ring in (fence.get("inclusion", box), *fence.get("exclusion", ()))]
+        return [table for table in tables if table is not None and table.ndim == 2 and table.shape[1] == 2]
+
 
 def read_run(folder: Path) -> Run:
     """Raises `ReportError` without a summary.json and a trajectory.csv that `fly` wrote."""

@@ -56,7 +56,7 @@ from flight.results import FlightResult, judge_flight, true_distance_m, truth_fr
 from flight.setpoint_loss import set_loss_action
 from flight.shadow import ShadowFlight
 from flight.status import Status
-from flight.summary import build_summary, write_json_atomic
+from flight.summary import build_summary, fence_summary, write_json_atomic
 from flight.tether import tethered
 from flight.tick import Pilot
 from flight.trajectory import draw_trajectory_png
@@ -336,7 +336,7 @@ class FlightSession:
                 "seed": self._mission.sim.seed if self._mission.sim else None,
                 "goal_m": [place.goal.x, place.goal.y, place.goal.z],
                 "goal_radius_m": self._mission.goal.radius_m,
-                "fence_m": {"min": self._mission.safety.fence.min_m, "max": self._mission.safety.fence.max_m},
+                "fence_m": fence_summary(self._mission.safety.fence),
                 "true_distance_to_goal_m": true_distance_m(report, place.goal),
                 "recording": asdict(recorded) if (recorded := self._recording.summary) is not None else None,
             },

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from flight.rate_keeper import LatenessStatistics, RateStatistics, percentiles_ms
 from flight.tick import TickRecord
 from flight.trajectory import FlightLog
+from safety.config import Fence
 from safety.frames import CorridorVector
 
 
@@ -108,6 +109,11 @@ def geofence_breaches(records: Sequence[TickRecord]) -> int:
         breaches += inside and margin_m < 0.0
         inside = margin_m >= 0.0
     return breaches
+
+
+def fence_summary(fence: Fence) -> dict[str, object]:
+    """The fence for the summary: the box around it, and its polygons, m."""
+    return {"min": fence.low_m, "max": fence.high_m, "inclusion": fence.polygon, "exclusion": fence.exclusion}
 
 
 def _smallest_clearance_m(records: Sequence[TickRecord]) -> float:

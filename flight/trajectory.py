@@ -146,7 +146,7 @@ def draw_trajectory_png(
 
 
 def _draw_surroundings(axes: Axes, boxes: NDArray[np.float64] | None, hits_m: NDArray[np.float64], fence: Fence | None) -> None:
-    from matplotlib.patches import Rectangle  # noqa: PLC0415
+    from matplotlib.patches import Polygon, Rectangle  # noqa: PLC0415
 
     if boxes is None:
         axes.plot(hits_m[:, 0], hits_m[:, 1], "s", color="#5b6470", markersize=1.5, label="seen by LiDAR", zorder=2)
@@ -157,12 +157,10 @@ def _draw_surroundings(axes: Axes, boxes: NDArray[np.float64] | None, hits_m: ND
             [(float(boxes[:, 0].min()), float(boxes[:, 1].min())), (float(boxes[:, 3].max()), float(boxes[:, 4].max()))]
         )
     if fence is not None:
-        (x0, y0, _), (x1, y1, _) = fence.min_m, fence.max_m
-        outline = Rectangle(
-            (x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor="#c0392b", linestyle=(0, (6, 4)), zorder=3, label="fence"
-        )
-        axes.add_patch(outline)
-        axes.update_datalim([(x0, y0), (x1, y1)])
+        for k, ring in enumerate((fence.polygon, *fence.exclusion)):
+            fill, label = ("#c0392b22", "") if k else ("none", "fence")
+            axes.add_patch(Polygon(ring, facecolor=fill, edgecolor="#c0392b", linestyle=(0, (6, 4)), zorder=3, label=label))
+            axes.update_datalim(ring)
 
 
 def _draw_goal(axes: Axes, goal: CorridorVector, radius_m: float) -> None:

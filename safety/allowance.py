@@ -2,7 +2,7 @@
 
 Braking must always stay available, so nothing may be worse than braking. Beyond that:
 
-* a point or face that braking keeps clear of by the full margin must be kept clear of by the full margin;
+* a point, edge or vertex that braking keeps clear of by the full margin must be kept clear of by the full margin;
 * once braking comes inside a margin anywhere, other points may be neared to a quarter of it, so that a vehicle can slide along;
 * a vehicle under a zero command still drifts by the error of its velocity estimate. Where it stands, or will after braking, a
   little inside a margin, a command must therefore lead out again: slowly, and only so far in that drift explains it;
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from safety.braking import Tubes, stop_gain_s
 from safety.config import SafetyConfig
+from safety.fence_tube import WaysOut
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -26,6 +27,7 @@ SLIDE_SHARE = 0.25  # of the margin: how far inside points may be neared, and wh
 HOLD_OFF_PER_S = 10.0  # speed outwards per metre inside; acts on the stop point, which follows a command at once
 POINT_BAND_M = 0.05  # hold off from points up to this far inside the hull; deeper is no drift
 FENCE_BAND_M = 0.5  # the same for the fence
+PROJECTIONS = 3  # two edges that meet, and back
 _LEAST_M = 1e-6
 _NO_NORMALS, _NO_SPEEDS = np.empty((2, 0)), np.empty(0)
 
@@ -34,17 +36,17 @@ _NO_NORMALS, _NO_SPEEDS = np.empty((2, 0)), np.empty(0)
 class Allowance:
     """Bounds on candidate commands of one tick.
 
-    `clearance_m` [k], `fence_m` [6]: least clearance of the tube beyond keep-out to each point, least distance inside each face
-    (low x, y, z, high x, y, z). `normals` [2, h], `outward_m_s` [h]: least part of a command along each horizontal direction.
-    `low_m_s`, `high_m_s` [3]: bounds per axis that keep the stop point inside the fence. `brake_stop_m` [2 models, 3].
+    `clearance_m` [k], `fence_m` [f]: least clearance of the tube beyond keep-out to each point, least room to each near piece of
+    the fence, floor and ceiling (last two). `normals` [2, h], `outward_m_s` [h]: least part of a command along each horizontal
+    direction. `sink_m_s`, `climb_m_s`: least and greatest vertical command. `brake_stop_m` [2 models, 3].
     """
 
     clearance_m: Floats
     fence_m: Floats
     normals: Floats
     outward_m_s: Floats
-    low_m_s: Floats
-    high_m_s: Floats
+    sink_m_s: float
+    climb_m_s: float
     brake_stop_m: Floats
 
     def shortfall_m_s(self, candidates: Floats) -> Floats:
@@ -55,17 +57,12 @@ class Allowance:
         return lacking
 
     def permits(self, candidates: Floats, clear_m: Floats, fence_m: Floats) -> Booleans:
-        """Which commands [c, 3], with tube clearances [c, k] and fence distances [c, 6], pass."""
+        """Which commands [c, 3], with tube clearances [c, k] and fence rooms [c, f], pass."""
         clear = (clear_m >= self.clearance_m - EPSILON_M).all(axis=1)
         inside = (fence_m >= self.fence_m - EPSILON_M).all(axis=1)
-        bounded = ((candidates >= self.low_m_s - EPSILON_M) & (candidates <= self.high_m_s + EPSILON_M)).all(axis=1)
-        permitted: Booleans = clear & inside & bounded & (self.shortfall_m_s(candidates) <= EPSILON_M)
+        level = (candidates[:, 2] >= self.sink_m_s - EPSILON_M) & (candidates[:, 2] <= self.climb_m_s + EPSILON_M)
+        permitted: Booleans = clear & inside & level & (self.shortfall_m_s(candidates) <= EPSILON_M)
         return permitted
-
-    def clipped(self, candidates: Floats) -> Floats:
-        """Candidates [c, 3] brought into the bounds per axis. The faces of a box are independent axes."""
-        within: Floats = np.minimum(np.maximum(candidates, self.low_m_s), self.high_m_s)
-        return within
 
     @property
     def push_m_s(self) -> Floats:
@@ -79,24 +76,34 @@ class Allowance:
 
 
 def allowance(
-    tube: Tubes, clear_m: Floats, fence_m: Floats, points_m: Floats, position_m: Floats, config: SafetyConfig
+    tube: Tubes,
+    clear_m: Floats,
+    fence_m: Floats,
+    points_m: Floats,
+    position_m: Floats,
+    ways: WaysOut | None,
+    config: SafetyConfig,
 ) -> Allowance:
     """The allowance set by braking.
 
-    `tube`: brake tubes whose last candidate is zero velocity; `clear_m` [k], `fence_m` [6]: its clearances; `points_m` [2, k];
-    `position_m` [2]: the vehicle now.
+    `tube`: brake tubes whose last candidate is zero velocity; `clear_m` [k], `fence_m` [f]: its clearances; `points_m` [2, k];
+    `position_m` [2]: the vehicle now; `ways`: out of the fence's margins, where braking comes into any.
     """
     slide = -SLIDE_SHARE * config.margin_m
     worst = float(clear_m.min()) if clear_m.shape[0] else 0.0
     normals, outward = _outward(tube, clear_m, points_m, position_m, config)
-    low, high = _axis_bounds(fence_m, config)
+    if ways is not None:
+        depth = -ways.room_m + slide
+        normals = np.concatenate((normals, ways.normals[:, depth > 0.0]), axis=1)
+        outward = np.concatenate((outward, _fence_hold_off_m_s(depth[depth > 0.0], config)))
+    sink, climb = _vertical_bounds(fence_m[-2:], config)
     return Allowance(
         clearance_m=np.minimum(clear_m, max(min(0.0, worst), slide)),
         fence_m=np.minimum(0.0, fence_m),
         normals=normals,
         outward_m_s=outward,
-        low_m_s=low,
-        high_m_s=high,
+        sink_m_s=sink,
+        climb_m_s=climb,
         brake_stop_m=tube.stop_m[:, -1],
     )
 
@@ -120,15 +127,34 @@ def _outward(tube: Tubes, clear_m: Floats, points_m: Floats, position_m: Floats,
     return away, np.where(depth <= config.margin_m + POINT_BAND_M, _hold_off_m_s(depth, config), 0.0)
 
 
-def _axis_bounds(fence_m: Floats, config: SafetyConfig) -> tuple[Floats, Floats]:
-    """Least and greatest command per axis [3]: the stop point reaches a face at most; beyond it, back inwards."""
-    room = np.maximum(fence_m, 0.0) / stop_gain_s(config)
-    if not (fence_m < 0.0).any():  # the usual case
-        return -room[:3], room[3:]
-    depth = -fence_m - SLIDE_SHARE * config.margin_m
-    inward = np.where((depth > 0.0) & (depth <= FENCE_BAND_M), _hold_off_m_s(depth, config), 0.0)
-    bound = np.where(inward > 0.0, -inward, room)
-    return -bound[:3], bound[3:]
+def _vertical_bounds(room_m: Floats, config: SafetyConfig) -> tuple[float, float]:
+    """Least and greatest vertical command: the stop point reaches floor or ceiling at most; beyond it, back inwards."""
+    depth = -room_m - SLIDE_SHARE * config.margin_m
+    inward = np.where(depth > 0.0, _fence_hold_off_m_s(depth, config), 0.0)
+    bound = np.where(inward > 0.0, -inward, np.maximum(room_m, 0.0) / stop_gain_s(config))
+    return -float(bound[0]), float(bound[1])
+
+
+def _fence_hold_off_m_s(depth_m: Floats, config: SafetyConfig) -> Floats:
+    """Speed due back inwards at depths > 0: none where it is more than drift."""
+    return np.where(depth_m <= FENCE_BAND_M, _hold_off_m_s(depth_m, config), 0.0)
+
+
+def held_in(candidates: Floats, ways: WaysOut, config: SafetyConfig) -> Floats:
+    """Candidates [c, 3] turned along the fence: the stop point may reach each near piece, and no further.
+
+    A few times the part that breaks the worst bound is taken off; in a corner that converges. What is still left is judged later.
+    """
+    if ways.room_m.shape[0] == 0:
+        return candidates
+    depth = -ways.room_m - SLIDE_SHARE * config.margin_m
+    due = np.where(depth > 0.0, _fence_hold_off_m_s(depth, config), -np.maximum(ways.room_m, 0.0) / stop_gain_s(config))
+    held, rows = candidates.copy(), np.arange(candidates.shape[0])
+    for _ in range(PROJECTIONS):
+        lacking = due - held[:, :2] @ ways.normals
+        worst = np.argmax(lacking, axis=1)
+        held[:, :2] += np.maximum(lacking[rows, worst], 0.0)[:, None] * ways.normals.T[worst]
+    return held
 
 
 def _hold_off_m_s(depth_m: Floats, config: SafetyConfig) -> Floats:

@@ -9,13 +9,17 @@ from __future__ import annotations
 import math
 from typing import Annotated, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from safety.fence import PolygonFence, Ring, polygon_fence
+from safety.fence_rules import fence_problem
 from safety.monitor_config import MonitorConfig
 
 Positive = Annotated[float, Field(gt=0.0, le=1000.0)]
 NotNegative = Annotated[float, Field(ge=0.0, le=1000.0)]
 Corner = tuple[float, float, float]
+_FORMS = "give min_m and max_m, or floor_m, ceiling_m and inclusion"
 
 
 class _Frozen(BaseModel):
@@ -23,19 +27,67 @@ class _Frozen(BaseModel):
 
 
 class Fence(_Frozen):
-    """A box the whole vehicle stays inside: two opposite corners (x, y, z) in the corridor frame, m.
+    """Where the whole vehicle stays, corridor frame, m: a box, or polygons between a floor and a ceiling.
 
-    The z coordinates are the altitude floor and ceiling (corridor z, 0 = ground at the corridor's origin).
+    Box: two opposite corners (x, y, z). Polygons: `inclusion`, less each of `exclusion`; vertices (x, y) in either order, concave
+    allowed. A box is the polygon of its four corners, and is treated as nothing else.
     """
 
-    min_m: Corner
-    max_m: Corner
+    min_m: Corner | None = None
+    max_m: Corner | None = None
+    floor_m: float | None = Field(None, description="lowest z (corridor z, 0 = ground at the corridor's origin)")
+    ceiling_m: float | None = Field(None, description="highest z")
+    inclusion: Ring | None = Field(None, description="the polygon inside which the vehicle stays")
+    exclusion: tuple[Ring, ...] = Field((), description="polygons outside which it stays")
+
+    @property
+    def polygon(self) -> Ring:
+        """Vertices of the inclusion polygon."""
+        if self.inclusion is not None:
+            return self.inclusion
+        (x0, y0, _), (x1, y1, _) = self._box()
+        return ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+
+    @property
+    def low_m(self) -> Corner:
+        """Lowest x, y and z of the fence: two corners of the box around it, with `high_m`."""
+        xs, ys = zip(*self.polygon, strict=True)
+        return min(xs), min(ys), self.floor_m if self.floor_m is not None else self._box()[0][2]
+
+    @property
+    def high_m(self) -> Corner:
+        """Highest x, y and z."""
+        xs, ys = zip(*self.polygon, strict=True)
+        return max(xs), max(ys), self.ceiling_m if self.ceiling_m is not None else self._box()[1][2]
+
+    def margin_m(self, x: float, y: float, z: float, radius_m: float = 0.0, half_height_m: float = 0.0) -> float:
+        """Distance of a point, or of a hull around it, to the fence, negative outside, m."""
+        sideways = float(polygon_fence(self.polygon, self.exclusion).signed_margin_m(np.array((x, y))))
+        return min(sideways - radius_m, min(z - self.low_m[2], self.high_m[2] - z) - half_height_m)
+
+    def _box(self) -> tuple[Corner, Corner]:
+        if self.min_m is None or self.max_m is None:
+            raise ValueError(f"fence: {_FORMS}")
+        return self.min_m, self.max_m
 
     @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        for axis, low, high in zip("xyz", self.min_m, self.max_m, strict=True):
+    def _one_form(self) -> Self:
+        box, polygons = (self.min_m, self.max_m), (self.floor_m, self.ceiling_m, self.inclusion)
+        if all(given is None for given in box) and all(given is not None for given in polygons):
+            if self.low_m[2] >= self.high_m[2]:
+                raise ValueError(f"fence z: floor_m {self.floor_m} must be smaller than ceiling_m {self.ceiling_m}")
+        elif self.exclusion or any(given is not None for given in polygons):
+            raise ValueError(f"fence: {_FORMS}, not some of both")
+        for axis, low, high in zip("xyz", *self._box(), strict=True) if self.inclusion is None else ():
             if low >= high:
                 raise ValueError(f"fence {axis}: min_m {low} must be smaller than max_m {high}")
+        return self
+
+    @model_validator(mode="after")
+    def _polygons_are_simple(self) -> Self:
+        problem = fence_problem(self.polygon, self.exclusion)
+        if problem is not None:
+            raise ValueError(f"fence {problem}")
         return self
 
 
@@ -47,6 +99,7 @@ class SafetyConfig(_Frozen):
     max_horizontal_speed_m_s: Positive = Field(1.2, description="longest horizontal velocity command")
     max_vertical_speed_m_s: Positive = Field(0.5, description="largest vertical velocity command, either way")
     max_acceleration_m_s2: Positive = Field(10.0, description="how fast a command may grow or turn; slowing down is free")
+    max_jerk_m_s3: Positive = Field(150.0, description="how fast that growth may itself grow or turn; easing off is free")
     max_yaw_rate_rad_s: Positive = Field(1.0, description="largest yaw rate command, either way")
 
     vehicle_radius_m: Positive = Field(0.35, description="A5: the vehicle fits into this horizontal circle")
@@ -86,12 +139,20 @@ class SafetyConfig(_Frozen):
         """Distance the vehicle's centre keeps from an obstacle, before estimate errors are added, m."""
         return self.vehicle_radius_m + self.margin_m
 
-    def keep_in(self) -> tuple[Corner, Corner]:
-        """The fence eroded by vehicle, position error and margin: where the vehicle's centre may be, two corners, m."""
-        side = self.vehicle_radius_m + self.position_error_m + self.margin_m
+    @property
+    def erosion_m(self) -> float:
+        """Distance the vehicle's centre keeps from edges of the fence along an axis; slanted ones get more (`PolygonFence`)."""
+        return self.vehicle_radius_m + self.position_error_m + self.margin_m
+
+    def eroded_fence(self) -> PolygonFence:
+        """The fence as the vehicle's centre must keep to it: radius, position error and margin taken off by distance."""
+        slack_m = self.position_error_m + self.margin_m
+        return polygon_fence(self.fence.polygon, self.fence.exclusion, self.vehicle_radius_m, slack_m)
+
+    def keep_in_z(self) -> tuple[float, float]:
+        """Lowest and highest z of the vehicle's centre, m."""
         height = self.vehicle_half_height_m + self.position_error_m + self.margin_m
-        (x0, y0, z0), (x1, y1, z1) = self.fence.min_m, self.fence.max_m
-        return (x0 + side, y0 + side, z0 + height), (x1 - side, y1 - side, z1 - height)
+        return self.fence.low_m[2] + height, self.fence.high_m[2] - height
 
     def stop_distance_m(self, speed_m_s: float) -> float:
         """Distance flown from a speed until standstill, dead time and tick included, m. Grows with the speed."""
@@ -109,11 +170,12 @@ class SafetyConfig(_Frozen):
         ):
             if getattr(self, low) > getattr(self, high):
                 raise ValueError(f"{low} {getattr(self, low)} must not exceed {high} {getattr(self, high)}")
-        for axis, inner_low, inner_high in zip("xyz", *self.keep_in(), strict=True):
-            if inner_low >= inner_high:
-                raise ValueError(
-                    f"fence {axis}: nothing is left of the fence after radius, position error and margin are taken off; widen it"
-                )
+        low_z, high_z = self.keep_in_z()
+        left = "is left of the fence after radius, position error and margin are taken off; widen it"
+        if low_z >= high_z:
+            raise ValueError(f"fence z: nothing {left}")
+        if self.eroded_fence().roomiest() is None:
+            raise ValueError(f"fence: no place {left}")
         return self
 
 

@@ -14,7 +14,7 @@ from safety.caps import cap_speed
 from safety.config import SafetyConfig
 from safety.frames import CorridorVector
 from safety.lidar import BeamTable, SeenScan, see
-from safety.limits import limit_command
+from safety.limits import AT_REST, limit_command, sent_after
 from safety.memory import ObstacleMemory
 from safety.messages import BRAKE, Health, Intervention, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
 from safety.monitors import REANCHORING, InputMonitor, Judgement
@@ -47,7 +47,7 @@ class SafetyFilter:
         self._monitor.reset()
         self._history.clear()
         self._memory.clear()
-        self._last = BRAKE.velocity
+        self._last = AT_REST
         self._last_time_s: float | None = None
         self._seen: SeenScan | None = None
         self.last_error = None
@@ -84,7 +84,7 @@ class SafetyFilter:
     ) -> tuple[SafeCommand, Verdict]:
         if health is not None and health.overruled:
             self._history.overrule()
-            self._last = BRAKE.velocity
+            self._last = AT_REST
         judged = self._monitor.judge(command, state, scan, now_s, self._history, health)
         if any(fault.rule in REANCHORING for fault in judged.faults):
             self._memory.clear()
@@ -128,10 +128,12 @@ class SafetyFilter:
 
     def _remember(self, sent: SafeCommand, now_s: float) -> None:
         """Add what was sent to the commands in flight. A clock that is not usable adds nothing."""
-        self._last = sent.velocity
+        dt_s = self.config.tick_s
         if math.isfinite(now_s) and (self._last_time_s is None or now_s >= self._last_time_s):
+            dt_s = max(self._dt_s(now_s), dt_s)
             self._last_time_s = now_s
             self._history.add(now_s, sent.velocity)
+        self._last = sent_after(self._last, sent.velocity, dt_s)
 
 
 def gate_problem(sent: SafeCommand, config: SafetyConfig) -> Intervention | None:

@@ -3,21 +3,39 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from safety.config import SafetyConfig, speed_cap_m_s
 from safety.frames import CorridorVector
-from safety.messages import Intervention, VelocityCommand
+from safety.messages import BRAKE, Intervention, VelocityCommand
 
 ROUNDING_M_S = 1e-9  # the time between two ticks is a difference of large numbers
 
 
+@dataclass(frozen=True, slots=True)
+class LastSent:
+    """The command last sent: its velocity, and what it had added to the one before, per second (zero after slowing down)."""
+
+    velocity: CorridorVector
+    acceleration: CorridorVector
+
+
+AT_REST = LastSent(BRAKE.velocity, BRAKE.velocity)
+
+
+def sent_after(last: LastSent, velocity: CorridorVector, dt_s: float) -> LastSent:
+    """What is to be remembered of a velocity command sent `dt_s` > 0 after the last one."""
+    added = _minus(velocity, _scaled(last.velocity, _kept_share(velocity, last.velocity)))
+    return LastSent(velocity, _scaled(added, 1.0 / dt_s))
+
+
 def limit_command(
-    command: VelocityCommand, last: CorridorVector, dt_s: float, range_max_m: float, config: SafetyConfig
+    command: VelocityCommand, last: LastSent, dt_s: float, range_max_m: float, config: SafetyConfig
 ) -> tuple[VelocityCommand, tuple[Intervention, ...]]:
-    """Scale a finite command into speed, sight, acceleration and yaw-rate limits; returned as it is when it obeys them all."""
+    """Scale a finite command into speed, sight, acceleration, jerk and yaw-rate limits; returned as it is when it obeys all."""
     found: list[Intervention] = []
     velocity = _limit_speed(command.velocity, range_max_m, config, found)
-    velocity = _limit_acceleration(velocity, last, dt_s, config, found)
+    velocity = _limit_growth(velocity, last, dt_s, config, found)
     yaw_rate = command.yaw_rate_rad_s
     if abs(yaw_rate) > config.max_yaw_rate_rad_s:
         found.append(Intervention("yaw_rate_limit", abs(yaw_rate), config.max_yaw_rate_rad_s))
@@ -45,18 +63,58 @@ def _limit_speed(velocity: CorridorVector, range_max_m: float, config: SafetyCon
     return CorridorVector(x, y, z)
 
 
-def _limit_acceleration(
-    velocity: CorridorVector, last: CorridorVector, dt_s: float, config: SafetyConfig, found: list[Intervention]
+def _limit_growth(
+    velocity: CorridorVector, last: LastSent, dt_s: float, config: SafetyConfig, found: list[Intervention]
 ) -> CorridorVector:
-    """Bound the step away from the part of the last command that is kept: slowing down along it is always free."""
-    length2 = last.x * last.x + last.y * last.y + last.z * last.z
-    along = velocity.x * last.x + velocity.y * last.y + velocity.z * last.z
-    keep = min(max(along / length2, 0.0), 1.0) if length2 > 0.0 else 0.0
-    bx, by, bz = last.x * keep, last.y * keep, last.z * keep
-    dx, dy, dz = velocity.x - bx, velocity.y - by, velocity.z - bz
-    step, limit = math.sqrt(dx * dx + dy * dy + dz * dz), config.max_acceleration_m_s2 * dt_s
-    if step <= limit + ROUNDING_M_S:
-        return velocity
-    found.append(Intervention("acceleration_limit", step, limit))
-    share = limit / step
-    return CorridorVector(bx + dx * share, by + dy * share, bz + dz * share)
+    """Shorten what is added to the part of the last command that is kept; slowing down, and adding less than before, is free."""
+    kept = _scaled(last.velocity, _kept_share(velocity, last.velocity))
+    added = _minus(velocity, kept)
+    step = _length(added)
+    limit = config.max_acceleration_m_s2 * dt_s
+    if step > limit + ROUNDING_M_S:
+        found.append(Intervention("acceleration_limit", step, limit))
+        added = _scaled(added, limit / step)
+    before, change = _scaled(last.acceleration, dt_s), config.max_jerk_m_s3 * dt_s * dt_s
+    share = _share_within(added, before, change)
+    if share < 1.0:
+        found.append(Intervention("jerk_limit", _length(added), share * _length(added)))
+        added = _scaled(added, share)
+    return velocity if step <= limit + ROUNDING_M_S and share == 1.0 else _minus(kept, _scaled(added, -1.0))
+
+
+def _share_within(added: CorridorVector, before: CorridorVector, change: float) -> float:
+    """Largest share (up to 1) of `added` that is no further than `change` from the way between zero and `before`."""
+    size2, before2 = _dot(added, added), _dot(before, before)
+    along = _dot(added, before)
+    nearest = _scaled(before, min(max(along / before2, 0.0), 1.0) if before2 > 0.0 else 0.0)
+    if _length(_minus(added, nearest)) <= change + ROUNDING_M_S:
+        return 1.0
+    if along <= 0.0:
+        return change / math.sqrt(size2)
+    across2 = max(size2 - along * along / before2, 0.0)
+    beside = change / math.sqrt(across2) if across2 > 0.0 else math.inf
+    if beside * along <= before2:
+        return beside
+    return (along + math.sqrt(max(along * along - size2 * (before2 - change * change), 0.0))) / size2
+
+
+def _kept_share(velocity: CorridorVector, last: CorridorVector) -> float:
+    """How much of the last command a new one keeps, 0 to 1."""
+    length2 = _dot(last, last)
+    return min(max(_dot(velocity, last) / length2, 0.0), 1.0) if length2 > 0.0 else 0.0
+
+
+def _dot(a: CorridorVector, b: CorridorVector) -> float:
+    return a.x * b.x + a.y * b.y + a.z * b.z
+
+
+def _length(a: CorridorVector) -> float:
+    return math.sqrt(_dot(a, a))
+
+
+def _minus(a: CorridorVector, b: CorridorVector) -> CorridorVector:
+    return CorridorVector(a.x - b.x, a.y - b.y, a.z - b.z)
+
+
+def _scaled(a: CorridorVector, factor: float) -> CorridorVector:
+    return CorridorVector(a.x * factor, a.y * factor, a.z * factor)

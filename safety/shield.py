@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from safety.allowance import EPSILON_M, Allowance, allowance
+from safety.allowance import EPSILON_M, Allowance, allowance, held_in
 from safety.braking import Start, Tubes, tubes
 from safety.config import SafetyConfig
+from safety.fence_tube import FenceGuard, NearFence
 from safety.frames import CorridorVector
 from safety.lidar import SeenScan, blind
 from safety.messages import Intervention
@@ -55,25 +56,26 @@ class Shield:
 
     def __init__(self, config: SafetyConfig) -> None:
         self._config = config
-        low, high = config.keep_in()
-        self._low, self._high = np.array(low), np.array(high)
+        self._guard = FenceGuard(config.eroded_fence(), *config.keep_in_z())
         directions = [(scale, 0.0) for scale in SCALES]
         directions += [(math.cos(turn), sign * turn) for turn in TURNS_RAD for sign in (1, -1)]
         self._scaled = np.array([(scale * math.cos(turn), scale * math.sin(turn)) for scale, turn in directions])
 
     def choose(self, wanted: CorridorVector, around: Surroundings) -> Decision:
         """The wanted velocity itself when it is safe (same object), else the nearest safe candidate, else zero."""
-        clearance, fence_margin = self._clearance_now(around), self._fence_margin(around.position)
-        around = self._within_reach(around)
+        reach = self._reach_m(around.start)
+        near = self._guard.look(around.position, around.start, reach)
+        clearance, fence_margin = self._clearance_now(around), near.room_m
+        around = self._within_reach(around, reach)
         first = np.array(((wanted.x, wanted.y, wanted.z), (0.0, 0.0, 0.0)))
         found: list[Intervention] = []
         first[0] = self._view_capped(first[:1], around, clearance, fence_margin, found)[0]
-        passed, brake = self._judge(first, around, found)
+        passed, brake = self._judge(first, around, near, found)
         if passed:
             if not found:
                 return Decision(wanted, (), clearance, fence_margin)
             return Decision(_vector(first[0]), tuple(found), clearance, fence_margin)
-        chosen = self._nearest(first[0], around, brake, clearance, fence_margin)
+        chosen = self._nearest(first[0], around, near, brake, clearance)
         return Decision(_vector(chosen), tuple(found), clearance, fence_margin)
 
     def _clearance_now(self, around: Surroundings) -> float:
@@ -83,26 +85,24 @@ class Shield:
         dx, dy = around.x_m - around.position.x, around.y_m - around.position.y
         return math.sqrt(float(np.min(dx * dx + dy * dy))) - self._config.vehicle_radius_m
 
-    def _within_reach(self, around: Surroundings) -> Surroundings:
-        """Only the points that some tube of this tick can come near to: the others cannot change a decision."""
-        config, start = self._config, around.start
+    def _reach_m(self, start: Start) -> float:
+        """How far from `start` some tube of this tick can come, errors and keep-out included, m."""
+        config = self._config
         fast = (
             max(math.hypot(v[0], v[1]) for v in start.velocity_m_s)
             + config.max_horizontal_speed_m_s * config.tick_s / config.lag_min_s
         )
         apart = math.dist(start.position_m[0, :2], start.position_m[1, :2])
         errors = config.velocity_error_m_s * config.delay_s + config.obstacle_speed_m_s * config.delay_s
-        reach = (
-            config.keep_out_m + apart + errors + config.stop_distance_m(fast + config.max_horizontal_speed_m_s * config.tick_s)
-        )
-        dx, dy = around.x_m - start.position_m[0, 0], around.y_m - start.position_m[0, 1]
-        near = dx * dx + dy * dy < (reach + around.extra_m) ** 2
-        return dataclasses.replace(around, x_m=around.x_m[near], y_m=around.y_m[near], extra_m=around.extra_m[near])
+        stop = config.stop_distance_m(fast + config.max_horizontal_speed_m_s * config.tick_s)
+        return config.keep_out_m + apart + errors + stop
 
-    def _fence_margin(self, position: CorridorVector) -> float:
-        """Smallest distance of the vehicle's centre to a face of the eroded fence, negative outside, m."""
-        p = (position.x, position.y, position.z)
-        return float(min(min(p[i] - self._low[i], self._high[i] - p[i]) for i in range(3)))
+    def _within_reach(self, around: Surroundings, reach_m: float) -> Surroundings:
+        """Only the points that some tube of this tick can come near to: the others cannot change a decision."""
+        start = around.start
+        dx, dy = around.x_m - start.position_m[0, 0], around.y_m - start.position_m[0, 1]
+        near = dx * dx + dy * dy < (reach_m + around.extra_m) ** 2
+        return dataclasses.replace(around, x_m=around.x_m[near], y_m=around.y_m[near], extra_m=around.extra_m[near])
 
     def _view_capped(
         self, candidates: Floats, around: Surroundings, clearance_m: float, fence_margin_m: float, found: list[Intervention]
@@ -124,25 +124,27 @@ class Shield:
         capped: Floats = candidates * np.stack((factor, factor, np.ones_like(factor)), axis=1)
         return capped
 
-    def _judge(self, first: Floats, around: Surroundings, found: list[Intervention]) -> tuple[bool, Allowance]:
+    def _judge(self, first: Floats, around: Surroundings, near: NearFence, found: list[Intervention]) -> tuple[bool, Allowance]:
         """Judge the wanted command (row 0) against the allowance that braking (row 1) sets."""
         tube = tubes(around.start, first, self._config)
-        clear, fence = self._tube_clearances(tube, around), self._tube_fence(tube)
+        clear, fence = self._tube_clearances(tube, around), self._guard.rooms_m(tube, around.start, near)
         points, position = np.array((around.x_m, around.y_m)), np.array((around.position.x, around.position.y))
-        allowed = allowance(tube, clear[1], fence[1], points, position, self._config)
+        ways = self._guard.ways_out(tube, near) if (fence[1, :-2] < 0.0).any() else None
+        allowed = allowance(tube, clear[1], fence[1], points, position, ways, self._config)
         passed = bool(allowed.permits(first[:1], clear[:1], fence[:1])[0])
         if not passed:
             found.extend(_reasons(allowed, first[0], clear[0], fence[0]))
         return passed, allowed
 
-    def _nearest(
-        self, wanted: Floats, around: Surroundings, allowed: Allowance, clearance_m: float, fence_margin_m: float
-    ) -> Floats:
+    def _nearest(self, wanted: Floats, around: Surroundings, near: NearFence, allowed: Allowance, clearance_m: float) -> Floats:
         """Of all candidates that pass, the one nearest to the wanted vector [3]; zeros when none passes."""
-        candidates = self._view_capped(self._candidates(wanted, around, allowed), around, clearance_m, fence_margin_m, [])
-        candidates = allowed.clipped(candidates)
+        brake = tubes(around.start, np.zeros((1, 3)), self._config)
+        candidates = held_in(self._candidates(wanted, around, allowed), self._guard.ways_out(brake, near), self._config)
+        candidates = self._view_capped(candidates, around, clearance_m, near.room_m, [])
+        candidates[:, 2] = np.clip(candidates[:, 2], allowed.sink_m_s, allowed.climb_m_s)
         tube = tubes(around.start, candidates, self._config)
-        passed = allowed.permits(candidates, self._tube_clearances(tube, around), self._tube_fence(tube))
+        rooms = self._guard.rooms_m(tube, around.start, near)
+        passed = allowed.permits(candidates, self._tube_clearances(tube, around), rooms)
         away = candidates - wanted
         cost = np.where(passed, np.einsum("ci,ci->c", away, away), math.inf)
         best = int(np.argmin(cost))
@@ -171,11 +173,6 @@ class Shield:
         inward, length = min(0.0, float(wanted @ normal)), math.hypot(wanted[0], wanted[1])
         return np.stack([wanted - (inward - share * length) * normal for share in OUTWARD])
 
-    def _tube_fence(self, tube: Tubes) -> Floats:
-        """Smallest distance inside each face of the eroded fence over a tube's corners, [c, 6], negative outside, m."""
-        corners = np.concatenate((tube.turn_m, tube.stop_m))
-        return np.concatenate(((corners - self._low).min(axis=0), (self._high - corners).min(axis=0)), axis=1)
-
     def _tube_clearances(self, tube: Tubes, around: Surroundings) -> Floats:
         """Smallest distance beyond keep-out between each tube and each known point, [c, k], m."""
         config, error = self._config, self._config.velocity_error_m_s
@@ -189,7 +186,7 @@ def _reasons(allowed: Allowance, wanted: Floats, clear_m: Floats, fence_m: Float
     """Which rules refuse the wanted command [3], each at its worst place."""
     reasons: list[Intervention] = []
     face = int(np.argmin(fence_m - allowed.fence_m))
-    outside = float(np.maximum(allowed.low_m_s - wanted, wanted - allowed.high_m_s).max()) > EPSILON_M
+    outside = max(allowed.sink_m_s - wanted[2], wanted[2] - allowed.climb_m_s) > EPSILON_M
     if outside or fence_m[face] < allowed.fence_m[face] - EPSILON_M:
         reasons.append(Intervention("fence", float(fence_m[face]), float(allowed.fence_m[face])))
     if clear_m.shape[0]:

@@ -60,7 +60,6 @@ class ScipGeometry:
         codes = np.where(mm > self.range_max_mm, NO_ECHO, np.where(mm < self.range_min_mm, TOO_NEAR, mm))
         return np.where(np.isnan(ranges), OTHER_ERROR, codes).astype(np.int64)
 
-
     def sent_codes(self, ranges_m: NDArray[np.floating]) -> NDArray[np.int64]:
         """As `codes`, of a device that may be faulty: fewer steps break off, a number far beyond the range is sent as it is."""
         ranges = np.full(self.steps, np.inf)

@@ -154,7 +154,11 @@ def _read_motion(state: Array, error: Array, acceleration_error: Array, out: Arr
         out[6 + i] = state[ACC + i] + acceleration_error[i]
         out[12 + i] = state[OMEGA + i]
     roll, pitch = roll_pitch_rad(state)
-    out[9], out[10], out[11] = roll + error[ATTITUDE_ERROR], pitch + error[ATTITUDE_ERROR + 1], yaw_rad(state) + error[ATTITUDE_ERROR + 2]
+    out[9], out[10], out[11] = (
+        roll + error[ATTITUDE_ERROR],
+        pitch + error[ATTITUDE_ERROR + 1],
+        yaw_rad(state) + error[ATTITUDE_ERROR + 2],
+    )
 
 
 class SensorNoise:

@@ -38,7 +38,7 @@ class Needs:
     @property
     def ceiling_m(self) -> float:
         """Top of the mission's fence above the ground."""
-        return self.mission.safety.fence.max_m[2]
+        return self.mission.safety.fence.high_m[2]
 
     @property
     def outer_hor_m(self) -> float:

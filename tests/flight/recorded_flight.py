@@ -15,7 +15,7 @@ from flight.recording_schema import FlightHeader, this_machine
 from flight.tick import Pilot, TickRecord
 from policy_export.runner import PolicyRunner
 from safety.config import Fence, SafetyConfig
-from safety.messages import LidarScan, VehicleState
+from safety.messages import Health, LidarScan, VehicleState
 from sim_gateway.world import load_world
 
 ROOT = Path(__file__).parents[2]
@@ -33,8 +33,8 @@ class RecordedPilot:
     def reset(self) -> None:
         self._pilot.reset()
 
-    def tick(self, scan: LidarScan | None, state: VehicleState | None, now_s: float) -> TickRecord:
-        record = self._pilot.tick(scan, state, now_s)
+    def tick(self, scan: LidarScan | None, state: VehicleState | None, now_s: float, health: Health | None = None) -> TickRecord:
+        record = self._pilot.tick(scan, state, now_s, health)
         self.records.append(record)
         self._recorder.tick(record, scan, state, record.sent, now_s + 0.001, self._pilot.goal)
         return record

@@ -43,7 +43,7 @@ def replaced(old: str, new: str) -> Callable[[str], str]:
         (
             "position_m: world",
             "position_m: [4.0, 3.9, 1.2]",
-            ("mission.yaml:10: goal", "goal.position_m y = 3.9", "outside", "fence"),
+            ("mission.yaml:10: goal", "goal.position_m (4, 3.9)", "outside", "fence"),
         ),
         ("takeoff_height_m: 1.0", "takeoff_height_m: .nan", ("mission.yaml:9", "takeoff_height_m", "finite")),
         ("max_m: [10.0, 4.0, 4.0]", "max_m: [10.0, .inf, 4.0]", ("safety.fence.max_m.1", "finite")),

@@ -28,7 +28,8 @@ from flight.checks.facts import VehicleFacts
 from flight.checks.hand_motion import HandTest
 from flight.checks.parameters import READ_ALSO, RULES, Needs, corrections, judge_parameters
 from flight.checks.vehicle import check_position, check_version
-from flight.fence_upload import FenceClient, GeoPoint, inner_corners_ned, inside, outer_fence
+from flight.fence_outline import cuts_into
+from flight.fence_upload import VERTEX_INCLUSION, FenceClient, FenceVertex, GeoPoint, outer_fence
 from flight.link import VehicleLink
 from flight.mission import load_mission
 from flight.preflight import Check, Level
@@ -322,9 +323,9 @@ def test_fence_is_uploaded_downloaded_and_cleared(air: Air, geo: GeoPoint) -> No
     frame = anchor_frame(air.link, air.mission, HERE, lambda: None)
     fence, client, store = outer_fence(air.mission.safety, frame, HERE), FenceClient(air.link), air.gateway.server.fence
     before = (store.uploads, store.downloads, store.clears)
-    client.upload(fence.vertices(geo))
+    client.upload(fence.items(geo))
     held = client.download()
-    assert [item.place for item in held] == fence.vertices(geo)
+    assert held == fence.items(geo)
     assert [item.polygon_size for item in held] == [4] * 4
     air.wait(lambda: (store.uploads, store.downloads) == (before[0] + 1, before[1] + 1), 2.0)  # the last ack is on its way
     for wanted, item in zip(fence.corners_ned, store.items, strict=True):  # in the vehicle's own projection
@@ -344,7 +345,7 @@ def test_outer_fence_is_larger_by_the_overshoot_on_every_side(air: Air) -> None:
     assert min(c.y for c in corners) == pytest.approx(-2.9 - 2.034)
     assert max(c.y for c in corners) == pytest.approx(1.9 + 2.034)
     assert fence.max_vertical_m == pytest.approx(3.0 + 1.568)
-    assert all(inside(corner, fence.corners_ned) for corner in inner_corners_ned(air.mission.safety, frame))
+    assert not cuts_into([tuple((c.x, c.y) for c in corners)], (), air.mission.safety.fence.polygon, ())
 
 
 def test_a_fence_that_cuts_into_the_missions_fails_and_none_warns(air: Air, geo: GeoPoint) -> None:
@@ -352,12 +353,13 @@ def test_a_fence_that_cuts_into_the_missions_fails_and_none_warns(air: Air, geo:
     client.clear()
     own = checkup(air)
     assert line(own.check_vehicle(air.link, VehicleFacts(air.link), HERE), "fence in PX4").level is Level.WARN
-    small = [geo.of_ned(NedVector(x, y, 0.0)) for x, y in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))]
+    corners = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+    small = [FenceVertex(VERTEX_INCLUSION, 4, geo.of_ned(NedVector(x, y, 0.0))) for x, y in corners]
     client.upload(small)
     found = line(own.check_vehicle(air.link, VehicleFacts(air.link), HERE), "fence in PX4")
     assert found.level is Level.FAIL
     assert "--apply" in found.advice
-    client.upload(outer_fence(air.mission.safety, CorridorFrame(NedVector(-1.0, 0.0, 0.0), 0.0), HERE).vertices(geo))
+    client.upload(outer_fence(air.mission.safety, CorridorFrame(NedVector(-1.0, 0.0, 0.0), 0.0), HERE).items(geo))
     assert line(own.check_vehicle(air.link, VehicleFacts(air.link), HERE), "fence in PX4").level is Level.PASS
     client.clear()
     assert frame.heading_rad == 0.0

@@ -87,18 +87,18 @@ def test_a_number_that_is_not_finite_is_refused_everywhere(tmp_path: Path, bad: 
     ("old", "new", "line", "words"),
     [
         ("flight_s: 100.0", "flight_x: 100.0", 10, "timeouts.flight_x: unknown key"),
-        ("[30.0, 0.5, 2.0]", "[36.0, 0.5, 2.0]", 5, r"goal\.position_m x = 36 m is outside"),
-        ("[30.0, 0.5, 2.0]", "[30.0, 3.7, 2.0]", 5, r"goal\.position_m y = 3.7 m is outside"),
+        ("[30.0, 0.5, 2.0]", "[36.0, 0.5, 2.0]", 5, r"goal\.position_m \(36, 0.5\) m is outside"),
+        ("[30.0, 0.5, 2.0]", "[30.0, 3.7, 2.0]", 5, r"goal\.position_m \(30, 3.7\) m is outside"),
         ("[30.0, 0.5, 2.0]", "[30.0, 0.5]", 5, r"goal\.position_m"),
         ("[30.0, 0.5, 2.0]", "world", 5, "`world` needs vehicle.connection: sim"),
         ("[4.0, 0.5]", "world", 3, "`world` needs vehicle.connection: sim"),
-        ("[4.0, 0.5]", "[4.0, -3.9]", 3, r"frame\.takeoff_point_m y = -3.9 m is outside"),
+        ("[4.0, 0.5]", "[4.0, -3.9]", 3, r"frame\.takeoff_point_m \(4, -3.9\) m is outside"),
         ("takeoff_height_m: 2.0", "takeoff_height_m: 3.95", 4, "takeoff_height_m: 3.95 m is outside"),
         ("takeoff_height_m: 2.0", "", 1, "takeoff_height_m: required key is missing"),
         ("udpin://127.0.0.1:14540", "tcp:somewhere", 2, "vehicle.connection"),
         ("udpin://127.0.0.1:14540", "udpin://127.0.0.1:14540 ; rm", 2, "vehicle.connection"),
         ("max_m: [35.0, 4.0, 4.0]", "max_m: [35.0, -4.0, 4.0]", 8, "fence y"),
-        ("min_m: [0.0, -4.0, 0.3]", "min_m: [0.0, -4.0, 3.9]", 7, "nothing is left of the fence"),
+        ("min_m: [0.0, -4.0, 0.3]", "min_m: [0.0, -4.0, 3.9]", 7, "fence z: nothing is left of the fence"),
         ("setpoint_loss_timeout_s: 0.5", "setpoint_loss_timeout_s: 5", 11, "setpoint_loss_timeout_s"),
         ("setpoint_loss_timeout_s: 0.5", "setpoint_loss_action: rtl", 11, "setpoint_loss_action"),
         ("[1.0, 0.5, 0.0]", "[14.0, 14.0, 0.0]", 12, "wind"),
@@ -155,3 +155,10 @@ def test_require_names_the_first_failed_check() -> None:
     require([passed, warned])
     with pytest.raises(RefusedError, match="preflight refused: three: broken; mend it"):
         require([passed, warned, Check("three", Level.FAIL, "broken", "mend it"), Check("four", Level.FAIL, "x", "y")])
+
+
+def test_the_example_with_polygons_is_valid_and_its_fence_is_kept() -> None:
+    safety = load_mission(ROOT / "configs" / "polygon_fence.yaml").safety
+    assert goal_problem(CorridorVector(20.0, 2.0, 2.0), safety) is None
+    assert "outside the safe part of the fence by 0.24 m" in str(goal_problem(CorridorVector(20.0, 3.0, 2.0), safety))
+    assert "outside" in str(takeoff_point_problem((12.0, -3.5), safety))

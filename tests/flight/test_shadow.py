@@ -145,8 +145,8 @@ def test_tether_reduces_speed_height_distance_and_time(corridor: Mission) -> Non
     assert safety.max_horizontal_speed_m_s == 0.4
     assert safety.max_vertical_speed_m_s == 0.3
     assert safety.max_yaw_rate_rad_s == 0.5
-    assert safety.fence.max_m[2] == 2.0
-    assert (safety.fence.min_m[0], safety.fence.max_m[0]) == (1.0, 7.0)
+    assert safety.fence.high_m[2] == 2.0
+    assert (safety.fence.low_m[0], safety.fence.high_m[0]) == (1.0, 7.0)
     assert reduced.timeouts.flight_s == 60.0
     assert reduced.takeoff_height_m < 2.0
     assert new_place.goal.x < 7.0
@@ -178,9 +178,9 @@ def test_tether_only_ever_reduces(
     before, after = mission.safety, reduced.safety
     assert after.max_horizontal_speed_m_s <= min(before.max_horizontal_speed_m_s, speed)
     assert after.max_vertical_speed_m_s <= min(before.max_vertical_speed_m_s, climb)
-    assert all(a >= b for a, b in zip(after.fence.min_m, before.fence.min_m, strict=True))
-    assert all(a <= b for a, b in zip(after.fence.max_m, before.fence.max_m, strict=True))
-    assert after.fence.max_m[2] <= height
+    assert all(a >= b for a, b in zip(after.fence.low_m, before.fence.low_m, strict=True))
+    assert all(a <= b for a, b in zip(after.fence.high_m, before.fence.high_m, strict=True))
+    assert after.fence.high_m[2] <= height
     assert goal_problem(place.goal, after) is None
     assert reduced.takeoff_height_m <= mission.takeoff_height_m
 

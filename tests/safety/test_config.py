@@ -30,7 +30,7 @@ brakings = st.floats(0.5, 6.0)
         ({"max_horizontal_speed_m_s": 0.0}, "greater than 0"),
         ({"margin_m": -0.01}, "greater than or equal to 0"),
         ({"max_speed": 1.0}, "Extra inputs"),
-        ({"vehicle_radius_m": 6.0}, "fence x|fence y"),
+        ({"vehicle_radius_m": 6.0}, "fence: no place is left"),
         ({"vehicle_half_height_m": 2.0}, "fence z"),
         ({"fence": {"min_m": (0, 0, 0), "max_m": (10, 0, 3)}}, "fence y"),
         ({"fence": {"min_m": (0, 0, 0), "max_m": (10, math.nan, 3)}}, "finite"),
@@ -50,6 +50,7 @@ def test_defaults_are_the_reviewed_numbers():
         "max_horizontal_speed_m_s": 1.2,
         "max_vertical_speed_m_s": 0.5,
         "max_acceleration_m_s2": 10.0,
+        "max_jerk_m_s3": 150.0,
         "max_yaw_rate_rad_s": 1.0,
         "vehicle_radius_m": 0.35,
         "vehicle_half_height_m": 0.1,
@@ -90,9 +91,9 @@ def test_delay_and_distances_add_up():
 
 def test_keep_in_takes_radius_margin_and_error_off():
     c = config(fence=Fence(min_m=(0, -4, 0), max_m=(10, 4, 3)), vehicle_radius_m=0.3, margin_m=0.1, position_error_m=0.05)
-    low, high = c.keep_in()
-    assert low == pytest.approx((0.45, -3.55, 0.25))
-    assert high == pytest.approx((9.55, 3.55, 2.75))
+    assert c.erosion_m == pytest.approx(0.45)
+    assert c.keep_in_z() == pytest.approx((0.25, 2.75))
+    assert c.eroded_fence().room_m([(0.45, 0.0), (9.55, 3.55), (5.0, 0.0)]) == pytest.approx([0.0, 0.0, 3.55])
 
 
 @given(speeds, lags, brakings)

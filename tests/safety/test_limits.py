@@ -1,0 +1,78 @@
+"""Acceleration and jerk of the command, as vectors, relative to the command last sent; slowing down and easing off are free."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safety_plant import command, config
+
+from safety.frames import CorridorVector
+from safety.limits import AT_REST, LastSent, limit_command, sent_after
+
+DT_S = 0.05
+part = st.floats(-1.0, 1.0)
+vector = st.tuples(part, part, st.floats(-0.5, 0.5))
+
+
+def v(x=0.0, y=0.0, z=0.0) -> CorridorVector:
+    return CorridorVector(x, y, z)
+
+
+def limited(wanted, last, **changes):
+    result, found = limit_command(command(*wanted), last, DT_S, 4.0, config(**changes))
+    return np.array((result.velocity.x, result.velocity.y, result.velocity.z)), {i.rule for i in found}
+
+
+def distance_to_way(p, end) -> float:
+    """Distance of a point from the straight way between zero and `end`."""
+    share = np.clip(p @ end / max(end @ end, 1e-300), 0.0, 1.0)
+    return float(np.linalg.norm(p - share * end))
+
+
+def test_growth_takes_two_ticks_from_rest():
+    first, rules = limited((1.0, 0.0), AT_REST)
+    assert first == pytest.approx((0.375, 0.0, 0.0))  # 150 m/s^3 for one tick
+    assert rules == {"acceleration_limit", "jerk_limit"}
+    last = sent_after(AT_REST, v(0.375), DT_S)
+    assert last.acceleration.x == pytest.approx(7.5)
+    second, rules = limited((1.0, 0.0), last)
+    assert second == pytest.approx((0.875, 0.0, 0.0))
+    assert rules == {"acceleration_limit"}
+
+
+@pytest.mark.parametrize("wanted", [(0.0, 0.0), (0.3, 0.0), (0.8, 0.0), (0.9, 0.0)])
+def test_braking_and_easing_off_are_free(wanted):
+    sent, rules = limited(wanted, LastSent(v(0.8), v(10.0)))
+    assert rules == set()
+    assert sent[0] == wanted[0]
+
+
+def test_a_turn_of_the_growth_is_limited_beside_the_way_and_beyond_its_end():
+    """10 m/s^2 ahead, then across: 0.375 m/s a tick beside the way that growth may shrink along, none of it slanted."""
+    fast = LastSent(v(), v(10.0))
+    across, rules = limited((0.0, 0.5), fast)
+    assert rules == {"jerk_limit"}
+    assert across == pytest.approx((0.0, 0.375, 0.0))
+    slanted, _ = limited((0.3, 0.4), fast, max_jerk_m_s3=100.0)
+    assert slanted == pytest.approx(np.array((0.75, 1.0, 0.0)) * 0.25)
+    beyond, _ = limited((0.6, 0.3), LastSent(v(), v(4.0)), max_jerk_m_s3=100.0)
+    assert np.linalg.norm(beyond - (0.2, 0.0, 0.0)) == pytest.approx(0.25)
+    assert beyond[1] / beyond[0] == pytest.approx(0.5)
+
+
+@given(vector, vector, vector, st.floats(1.0, 300.0), st.floats(1.0, 15.0))
+@settings(max_examples=300, deadline=None)
+def test_growth_never_jumps_by_more_than_the_jerk(wanted, last, growth, jerk, acceleration):
+    growth = np.array(growth) * acceleration
+    sent, _ = limited(wanted, LastSent(v(*last), v(*growth)), max_jerk_m_s3=jerk, max_acceleration_m_s2=acceleration)
+    wanted, last = np.array(wanted), np.array(last)
+    keep = np.clip(wanted @ last / max(last @ last, 1e-300), 0.0, 1.0)
+    added = sent - keep * last
+    assert distance_to_way(added, growth * DT_S) <= jerk * DT_S**2 + 1e-6
+    assert np.linalg.norm(added) <= acceleration * DT_S + 1e-6
+    assert np.linalg.norm(np.cross(added, wanted - keep * last)) < 1e-9  # shorter, never turned
+    assert math.hypot(*sent[:2]) <= 1.2 + 1e-9
