@@ -28,6 +28,14 @@ from campaigns.mutation.report import collect, figures, load_equivalents
 from campaigns.mutation.suite import properties, suite_digest
 from campaigns.mutation.testmap import BaselineError, TestMap
 
+SLOW = [
+    "test_closed_loop.py",
+    "test_closed_loop_vehicle.py",
+    "test_fence_closed_loop.py",
+    "test_fence_oracle.py",
+    "test_false_alarms.py",
+]
+
 
 def options() -> argparse.Namespace:
     """The command line."""
@@ -38,6 +46,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--work", type=Path, default=Path("runs/mutation"), help="folder of the ledger and the map of the tests")
     parser.add_argument("--fresh", action="store_true", help="forget all verdicts first")
     parser.add_argument("--budget-s", type=float, default=math.inf, help="per mutant, only the fastest tests of this much time")
+    parser.add_argument("--without", nargs="*", default=SLOW, help="test files that are left out")
     parser.add_argument("--list", action="store_true", help="print the survivors that have no proof")
     return parser.parse_args()
 
@@ -57,7 +66,7 @@ def main() -> int:
     ledger_path = chosen.work / "ledger.sqlite"
     if chosen.fresh:
         ledger_path.unlink(missing_ok=True)
-    tests = TestMap(root, chosen.work / "tests.json")
+    tests = TestMap(root, chosen.work / "tests.json", chosen.without)
     print(f"recorded: {', '.join(tests.refresh(chosen.jobs)) or 'nothing new'}", flush=True)
     suite = suite_digest(root, chosen.budget_s)
     paths = chosen.module or list(sources(root))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -78,12 +78,12 @@ def _foreign() -> Iterator[str]:
 
 
 class TestMap:
-    """The whole map. `digests`: of everything a file's record depends on."""
+    """The whole map. `without`: names of test files that are not used (slow ones)."""
 
     __test__ = False
 
-    def __init__(self, root: Path, store: Path) -> None:
-        self._root, self._store = root, store
+    def __init__(self, root: Path, store: Path, without: Collection[str] = ()) -> None:
+        self._root, self._store, self._without = root, store, without
         self.files: dict[str, FileMap] = {}
 
     def refresh(self, at_once: int) -> list[str]:
@@ -108,6 +108,7 @@ class TestMap:
         return {
             path.relative_to(self._root).as_posix(): hashlib.sha256((shared + path.read_text()).encode()).hexdigest()
             for path in own
+            if path.name not in self._without
         }
 
     @property

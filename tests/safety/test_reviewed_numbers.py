@@ -77,7 +77,7 @@ REVIEWED = {
     "residual.SAMPLES": 64,
     "residual.LEAST_SPEED_M_S": 0.2,
     "residual.LEAST_CHANGE_M_S": 0.1,
-    "residual.EVIDENCE": 0.05,
+    "residual.EVIDENCE": 0.08,
     "residual.SHARE_MOST": 2.0,
     "residual.ROUNDING_S": 1e-06,
     "scan_monitor.REFERENCE_S": 1.0,
@@ -99,8 +99,8 @@ def test_constants_are_the_reviewed_numbers():
 MONITORS = {
     "position_jump_m": 0.25,
     "altitude_jump_m": 0.25,
-    "velocity_mismatch_m_s": 1.5,
-    "velocity_window_s": 0.3,
+    "velocity_mismatch_m_s": 1.6,
+    "velocity_window_s": 0.4,
     "jumps_window_s": 5.0,
     "frozen_state_s": 0.2,
     "frozen_command_m_s": 0.3,
@@ -140,7 +140,7 @@ MONITORS = {
     "braking_weak": 0.9,
     "braking_healthy": 1.0,
     "braking_failed": 0.7,
-    "braking_failed_s": 1.0,
+    "braking_failed_s": 0.5,
     "cap_least": 0.25,
 }
 ESCALATION = {"hold_after_s": 2.0, "land_after_s": 10.0, "healthy_s": 1.0, "blocked_hold_s": 15.0}
