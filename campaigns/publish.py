@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from campaigns.process_death import markdown
+from campaigns.strength import strength
 from policy_export.errors import PolicyError
 from policy_export.policy_file import PolicyFile, read_policy_file
 
@@ -22,6 +23,7 @@ README = Path("README.md")
 SAFETY = Path("docs/safety.md")
 BEGIN, END = "<!-- results -->", "<!-- end of results -->"
 PROCESS_DEATH = "<!-- process death -->", "<!-- end of process death -->"
+STRENGTH = "<!-- strength of the tests -->", "<!-- end of strength of the tests -->"
 PAPER_UNSEEN_SUCCESS = "77.4 %"
 PAPER_PATH_EFFICIENCY = "0.85"
 
@@ -126,6 +128,8 @@ def publish() -> None:
     _write_block(README, BEGIN, END, f"{table(lockstep_rows(results) + realtime_rows(results))}\n\n{note}")
     if "process_death" in results:
         _write_block(SAFETY, *PROCESS_DEATH, process_death(results["process_death"]))
+    if "mutation" in results:
+        _write_block(SAFETY, *STRENGTH, strength(results))
 
 
 def process_death(result: dict[str, Any]) -> str:

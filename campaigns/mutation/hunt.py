@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import random
 import sys
@@ -20,7 +21,7 @@ from campaigns.mutation.inplace import function_at, replace
 from campaigns.mutation.ledger import KILLED, NO_CHANGE, SURVIVED, TIMEOUT, Ledger, Verdict
 from campaigns.mutation.mutants import Mutant, SourceFile, changed_lines, mutants_of, sources
 from campaigns.mutation.probe import Probe, fixed_examples, run_tests
-from campaigns.mutation.testmap import TestMap
+from campaigns.mutation.testmap import BaselineError, TestMap
 
 CPU_SLACK_S = 10.0
 CPU_PER_SECOND = 3.0  # a mutant may make its tests this much slower before it is stopped
@@ -162,6 +163,7 @@ class Task:
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """In place of running the tests once: with everything imported and collected, fork for every mutant."""
         ledger = Ledger(self.ledger)
+        self._check_soundness(session, ledger)
         for path in self.paths:
             hunt = Hunt(self.root, path, self.tests, self.budget_s)
             known = ledger.known(path, hunt.source, self.suite)
@@ -172,6 +174,18 @@ class Task:
                 self.report(mutant, verdict)
         ledger.close()
         return True
+
+    def _check_soundness(self, session: pytest.Session, ledger: Ledger) -> None:
+        """Without any change every test must pass in a forked child too, or each mutant would seem killed."""
+        state = hashlib.sha256("".join([self.suite, *sources(self.root).values()]).encode()).hexdigest()
+        if ledger.is_sound(state):
+            return
+        seconds = self.tests.seconds
+        job = Job("unchanged", partial(run_items, session, list(seconds)), CPU_SLACK_S + CPU_PER_SECOND * sum(seconds.values()))
+        answer = dict(run_forked(iter([job]), 1))["unchanged"]
+        if answer.get("failed") or answer.get("tests") != len(seconds):
+            raise BaselineError(f"without any change: {answer}")
+        ledger.mark_sound(state)
 
 
 def hunt_all(task: Task) -> None:

@@ -35,6 +35,17 @@ class Ledger:
             " primary key (path, digest, operator, occurrence))"
         )
 
+        self._db.execute("create table if not exists sound (state text primary key)")
+
+    def is_sound(self, state: str) -> bool:
+        """Whether all tests passed, without any change, for this state of sources and tests."""
+        return self._db.execute("select 1 from sound where state = ?", (state,)).fetchone() is not None
+
+    def mark_sound(self, state: str) -> None:
+        """They did."""
+        with self._db:
+            self._db.execute("insert or replace into sound values (?)", (state,))
+
     def known(self, path: str, source: str, suite: str) -> dict[tuple[str, int], Verdict]:
         """Verdicts that hold for this source: a kill stays one, anything else holds for the same tests only."""
         rows = self._db.execute(
