@@ -26,7 +26,8 @@ from pydantic import BaseModel, ConfigDict
 from campaigns.mutation.forks import Answer, Job, run_forked
 from campaigns.mutation.hotswap import preload, swap, unaffected
 from campaigns.mutation.mutants import sources
-from campaigns.mutation.probe import fixed_examples, run_tests
+from campaigns.mutation.probe import fixed_examples, function_of, run_tests
+from campaigns.mutation.suite import SLOW
 from campaigns.mutation.testmap import BaselineError, TestMap
 from strict_yaml import ConfigError, load_config
 
@@ -74,7 +75,7 @@ class Outcome:
     @property
     def noticed(self) -> bool:
         """Whether enough tests noticed it."""
-        return len(self.tests) >= LEAST_TESTS
+        return len(set(map(function_of, self.tests))) >= LEAST_TESTS
 
 
 def load_accidents(folder: Path = FOLDER) -> list[Accident]:
@@ -167,7 +168,7 @@ def main() -> int:
     else:
         chosen.work.mkdir(parents=True, exist_ok=True)
         sys.pycache_prefix, sys.dont_write_bytecode = str(chosen.work / "pycache"), False
-        known = TestMap(root, chosen.work / "tests.json")
+        known = TestMap(root, chosen.work / "tests.json", SLOW)
         known.refresh(chosen.jobs)
         preload(known.modules)
         tests = orders(root, accidents, known)

@@ -25,16 +25,8 @@ from campaigns.mutation.ledger import KILLED, Ledger, Verdict
 from campaigns.mutation.mutants import Mutant, sources
 from campaigns.mutation.probe import EXAMPLES
 from campaigns.mutation.report import collect, figures, load_equivalents
-from campaigns.mutation.suite import properties, suite_digest
+from campaigns.mutation.suite import SLOW, properties, suite_digest
 from campaigns.mutation.testmap import BaselineError, TestMap
-
-SLOW = [
-    "test_closed_loop.py",
-    "test_closed_loop_vehicle.py",
-    "test_fence_closed_loop.py",
-    "test_fence_oracle.py",
-    "test_false_alarms.py",
-]
 
 
 def options() -> argparse.Namespace:
@@ -46,7 +38,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--work", type=Path, default=Path("runs/mutation"), help="folder of the ledger and the map of the tests")
     parser.add_argument("--fresh", action="store_true", help="forget all verdicts first")
     parser.add_argument("--budget-s", type=float, default=math.inf, help="per mutant, only the fastest tests of this much time")
-    parser.add_argument("--without", nargs="*", default=SLOW, help="test files that are left out")
+    parser.add_argument("--without", nargs="*", default=list(SLOW), help="test files that are left out")
     parser.add_argument("--list", action="store_true", help="print the survivors that have no proof")
     return parser.parse_args()
 

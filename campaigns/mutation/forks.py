@@ -9,6 +9,7 @@ import resource
 import selectors
 import signal
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
@@ -39,7 +40,7 @@ class _Child(Generic[T]):
 
 
 def run_forked(jobs: Iterator[Job[T]], at_once: int) -> Iterator[tuple[T, Answer]]:
-    """Answers in the order in which they come. A child that ends without one answers {"ended": how}."""
+    """Answers in the order in which they come. A child that ends without one: {"ended": how}; errors are raised here."""
     running: dict[int, _Child[T]] = {}
     selector = selectors.DefaultSelector()
     gc.collect()
@@ -99,12 +100,21 @@ def _work(job: Job[T], writing: int) -> None:
         silent = os.open(os.devnull, os.O_RDWR)
         for descriptor in (0, 1, 2):
             os.dup2(silent, descriptor)
-        data = json.dumps(job.work()).encode()
+        data = json.dumps(_answer(job)).encode()
         while data:
             data = data[os.write(writing, data) :]
         code = 0
     finally:
         os._exit(code)
+
+
+def _answer(job: Job[T]) -> Answer:
+    try:
+        return job.work()
+    except MemoryError:
+        raise
+    except Exception:  # noqa: BLE001  told to the parent, which raises it
+        return {"error": traceback.format_exc()}
 
 
 def _end(child: _Child[T]) -> Answer:
@@ -120,6 +130,8 @@ def _end(child: _Child[T]) -> Answer:
             answer: Answer = json.loads(child.answer)
         except ValueError:
             return {"ended": "answer cut off"}
+        if "error" in answer:
+            raise ChildProcessError(f"{child.key}: {answer['error']}")
         return answer
     if time.monotonic() > child.deadline_s or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU):
         return {"ended": "time"}

@@ -24,9 +24,13 @@ CHOSEN_SETTINGS = "_hypothesis_internal_use_settings"  # where hypothesis keeps 
 
 @dataclass(eq=False)
 class Probe:
-    """A pytest plugin: keeps the tests of `order` (all when None), in that order; notes durations and failures."""
+    """A pytest plugin: keeps the tests of `order` (all when None), in that order; notes durations and failures.
+
+    Ends the run when so many different test functions have failed (0: never); one that has failed is not run again.
+    """
 
     order: list[str] | None
+    enough: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
     failed: dict[str, str] = field(default_factory=dict)
 
@@ -52,6 +56,14 @@ class Probe:
         if report.failed:
             self.failed[report.nodeid] = report.longreprtext[-400:]
 
+    def pytest_runtest_setup(self, item: pytest.Item) -> None:
+        """Leave out what would say the same once more."""
+        if self.enough and function_of(item.nodeid) in map(function_of, self.failed):
+            pytest.skip("failed already")
+        if self.enough and len(set(map(function_of, self.failed))) >= self.enough:
+            item.session.shouldstop = "enough"
+            pytest.skip("enough have failed")
+
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
         """A test file that cannot even be imported."""
         if report.failed:
@@ -60,6 +72,11 @@ class Probe:
     def pytest_internalerror(self, excrepr: object) -> None:
         """An error outside any test."""
         self.failed["pytest"] = str(excrepr)[-400:]
+
+
+def function_of(name: str) -> str:
+    """The test function of a test: without its parameters."""
+    return name.partition("[")[0]
 
 
 def _fewer_examples(item: pytest.Item) -> None:
@@ -83,12 +100,12 @@ def fixed_examples() -> None:
     hypothesis.settings.load_profile(PROFILE)
 
 
-def run_tests(root: Path, files: list[str], order: list[str] | None, failures: int, plugins: tuple[Any, ...] = ()) -> Probe:
-    """Run tests of some files until so many have failed (0: all)."""
-    probe = Probe(order)
+def run_tests(root: Path, files: list[str], order: list[str] | None, enough: int, plugins: tuple[Any, ...] = ()) -> Probe:
+    """Run tests of some files until so many different ones have failed (0: all)."""
+    probe = Probe(order, enough)
     sys.path[:0] = [str(root)]
     os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # quick to start; hypothesis works without its own
-    arguments = [*OPTIONS, f"--maxfail={failures}", f"--rootdir={root}", "-c", str(root / "pyproject.toml")]
+    arguments = [*OPTIONS, *(["--exitfirst"] if enough == 1 else []), f"--rootdir={root}", "-c", str(root / "pyproject.toml")]
     code = pytest.main([*arguments, *(str(root / name) for name in files)], plugins=[probe, *plugins])
     if code != pytest.ExitCode.OK and not probe.failed:
         probe.failed["pytest"] = f"exit code {int(code)}"

@@ -90,7 +90,7 @@ def test_children_answer_fail_and_are_stopped():
 
     jobs = [
         Job("answer", lambda: {"pid": os.getpid()}, 5.0),
-        Job("raise", lambda: {}["nothing"], 5.0),
+        Job("exit", lambda: os._exit(3), 5.0),
         Job("spin", spin, 0.1),
         Job("sleep", lambda: time.sleep(60) or {}, 0.1),
         Job("memory", lambda: {"size": len(bytearray(1 << 40))}, 5.0),
@@ -98,10 +98,15 @@ def test_children_answer_fail_and_are_stopped():
     begin = time.monotonic()
     answers = dict(run_forked(iter(jobs), 3))
     assert answers["answer"]["pid"] != os.getpid()
-    assert answers["raise"]["ended"].startswith("exit")
+    assert answers["exit"] == {"ended": "exit 3"}
     assert answers["spin"] == answers["sleep"] == {"ended": "time"}
     assert answers["memory"]["ended"].startswith("exit")
     assert time.monotonic() - begin < 30.0
+
+
+def test_an_error_of_the_hunt_itself_is_no_kill():
+    with pytest.raises(ChildProcessError, match="KeyError"):
+        list(run_forked(iter([Job("raise", lambda: {}["nothing"], 5.0)]), 1))
 
 
 def test_running_out_of_time_is_no_kill():

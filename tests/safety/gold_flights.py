@@ -124,7 +124,13 @@ def fly(number: int) -> list[list]:
     last = first + chance.choice((2, 6, 25))
     level, rows = EscalationState(), []
     for k in range(TICKS):
-        tick = {"k": k, "command": next(plan), "state": tilted(plant.estimate(), chance), "scan": plant.scan(), "now_s": plant.time_s}
+        tick = {
+            "k": k,
+            "command": next(plan),
+            "state": tilted(plant.estimate(), chance),
+            "scan": plant.scan(),
+            "now_s": plant.time_s,
+        }
         if faulty and first <= k < last:
             tick = FAULTS[name](tick)
         tick.pop("k")
@@ -138,7 +144,16 @@ def fly(number: int) -> list[list]:
 def row(sent, verdict, level) -> list:
     """One tick as JSON: rounded far below anything that matters, far above rounding errors."""
     v, found = sent.velocity, [[i.rule, short(i.value), short(i.limit)] for i in verdict.interventions]
-    numbers = (v.x, v.y, v.z, sent.yaw_rate_rad_s, verdict.clearance_m, verdict.fence_margin_m, verdict.scan_age_s, verdict.state_age_s)
+    numbers = (
+        v.x,
+        v.y,
+        v.z,
+        sent.yaw_rate_rad_s,
+        verdict.clearance_m,
+        verdict.fence_margin_m,
+        verdict.scan_age_s,
+        verdict.state_age_s,
+    )
     return [[short(x) for x in numbers], verdict.braking, verdict.fault, found, int(level.level), level.cause]
 
 
@@ -154,4 +169,4 @@ def path(number: int) -> Path:
 if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
     for flight in (*CALM_FLIGHTS, *FAULTY_FLIGHTS):
-        path(flight).write_text("[\n" + ",\n".join(json.dumps(one, separators=(',', ':')) for one in fly(flight)) + "\n]\n")
+        path(flight).write_text("[\n" + ",\n".join(json.dumps(one, separators=(",", ":")) for one in fly(flight)) + "\n]\n")

@@ -28,7 +28,16 @@ def test_flights_meet_every_stage():
     """Gold that is all alike would prove nothing."""
     rows = [row for flight in (*CALM_FLIGHTS, *FAULTY_FLIGHTS) for row in json.loads(path(flight).read_text())]
     rules = [found[0] for row in rows for found in row[3]]
-    for rule in ("obstacle", "fence", "hold_off", "return_speed", "blind_speed", "speed_limit", "acceleration_limit", "speed_cap"):
+    for rule in (
+        "obstacle",
+        "fence",
+        "hold_off",
+        "return_speed",
+        "blind_speed",
+        "speed_limit",
+        "acceleration_limit",
+        "speed_cap",
+    ):
         assert rules.count(rule) >= 10, rule
     assert len({row[2] for row in rows}) >= 15
     assert {row[4] for row in rows} == {0, 1, 2, 3, 4}
