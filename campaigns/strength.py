@@ -17,24 +17,26 @@ def strength(results: dict[str, dict[str, Any]]) -> str:
 
 def mutation(result: dict[str, Any]) -> str:
     """The score per file, and what is not killed."""
-    real = result["mutants"] - result["only_annotations"]
+    real = result["mutants"] - result["only_annotations"] - result["not_run"]
     text = (
-        f"`{result['command']}`: cosmic-ray {result['cosmic_ray']} makes {result['mutants']} mutants, "
-        f"{result['only_annotations']} of which change annotations that never run. Of the other {real}, {result['killed']} "
-        f"are killed ({100 * result['score']:.2f} %), {result['proved_equivalent']} are proved equivalent one by one "
-        f"({100 * result['equivalent_share']:.2f} %, `tests/safety/equivalent_mutants.json`), {result['unexplained']} "
-        f"survive unexplained ({result['timeout']} of them ran out of time, which is no kill), {result['not_run']} were "
-        f"not run. {result['tests']} tests, {result['properties']} of them properties of hypothesis."
+        f"`{result['command']}`: cosmic-ray {result['cosmic_ray']} makes {result['mutants']} mutants. {result['not_run']} were "
+        f"not run, {result['only_annotations']} change annotations that never run. Of the other {real}, chosen at random where "
+        f"not all were run, {result['killed']} are killed ({100 * result['score']:.2f} %), {result['proved_equivalent']} are "
+        f"proved equivalent one by one ({100 * result['equivalent_share']:.2f} %, `tests/safety/equivalent_mutants.json`), "
+        f"{result['unexplained']} survive unexplained ({result['timeout']} of them ran out of time, which is no kill). "
+        f"{result['tests']} tests, {result['properties']} of them properties of hypothesis."
     )
     rows = [
-        f"| `{path}` | {counts['mutants']} | {counts.get('killed', 0)} | {counts.get('proved equivalent', 0)} | {_open(counts)} |"
+        f"| `{path}` | {counts['mutants']} | {counts.get('not run', 0)} | {counts.get('killed', 0)} | {counts.get('proved equivalent', 0)} | {_open(counts)} |"
         for path, counts in result["files"].items()
     ]
-    return "\n".join([text, "", "| file | mutants | killed | proved equivalent | unexplained |", "|---|---|---|---|---|", *rows])
+    return "\n".join(
+        [text, "", "| file | mutants | not run | killed | proved equivalent | unexplained |", "|---|---|---|---|---|---|", *rows]
+    )
 
 
 def _open(counts: dict[str, int]) -> int:
-    return counts.get("survived", 0) + counts.get("timeout", 0) - counts.get("proved equivalent", 0) + counts.get("not run", 0)
+    return counts.get("survived", 0) + counts.get("timeout", 0) - counts.get("proved equivalent", 0)
 
 
 def crosscheck(result: dict[str, Any]) -> str:

@@ -148,7 +148,7 @@ def run_items(session: pytest.Session, order: list[str]) -> Answer:
 
 @dataclass(eq=False)
 class Task:
-    """What to hunt: files, and how."""
+    """What to hunt: files, and how. `sample`: so many mutants of each file, chosen at random; None = all."""
 
     root: Path
     paths: list[str]
@@ -156,6 +156,7 @@ class Task:
     ledger: Path
     suite: str
     budget_s: float
+    sample: int | None
     at_once: int
     report: Report
 
@@ -166,9 +167,9 @@ class Task:
         self._check_soundness(session, ledger)
         for path in self.paths:
             hunt = Hunt(self.root, path, self.tests, self.budget_s)
-            known = ledger.known(path, hunt.source, self.suite)
-            pending = [m for m in mutants_of(path, hunt.source) if (m.operator, m.occurrence) not in known]
-            random.Random(path).shuffle(pending)  # a run that is stopped has seen a fair sample
+            known, mutants = ledger.known(path, hunt.source, self.suite), mutants_of(path, hunt.source)
+            random.Random(path).shuffle(mutants)  # a run that is stopped, or a sample, has seen a fair choice
+            pending = [m for m in mutants[: self.sample] if (m.operator, m.occurrence) not in known]
             for mutant, verdict in hunt.run(pending, self.at_once, session):
                 ledger.add(mutant, hunt.source, self.suite, verdict)
                 self.report(mutant, verdict)

@@ -105,7 +105,13 @@ def run_tests(root: Path, files: list[str], order: list[str] | None, enough: int
     probe = Probe(order, enough)
     sys.path[:0] = [str(root)]
     os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # quick to start; hypothesis works without its own
-    arguments = [*OPTIONS, *(["--exitfirst"] if enough == 1 else []), f"--rootdir={root}", "-c", str(root / "pyproject.toml")]
+    arguments = [
+        *OPTIONS,
+        *(["--exitfirst"] if enough == 1 else ["--continue-on-collection-errors"]),
+        f"--rootdir={root}",
+        "-c",
+        str(root / "pyproject.toml"),
+    ]
     code = pytest.main([*arguments, *(str(root / name) for name in files)], plugins=[probe, *plugins])
     if code != pytest.ExitCode.OK and not probe.failed:
         probe.failed["pytest"] = f"exit code {int(code)}"

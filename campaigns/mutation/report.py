@@ -61,7 +61,7 @@ def figures(found: list[tuple[Mutant, Verdict | None]], equivalents: list[Equiva
                 asdict(mutant) | {"outcome": verdict.outcome, "before": verdict.before, "after": verdict.after, "proof": proof}
             )
     total = sum(per_file.values(), Counter())
-    real = total["mutants"] - total[NO_CHANGE]
+    real = total["mutants"] - total[NO_CHANGE] - total["not run"]
     return {
         "mutants": total["mutants"],
         "only_annotations": total[NO_CHANGE],

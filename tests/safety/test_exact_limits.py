@@ -1,4 +1,4 @@
-"""Limits met exactly, and passed by the least there is: what a wrong comparison or a number off by a little would get away with."""
+"""Limits met exactly, and passed by the least there is: what a wrong comparison would get away with."""
 
 from __future__ import annotations
 
