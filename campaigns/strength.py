@@ -26,17 +26,17 @@ def mutation(result: dict[str, Any]) -> str:
         f"{result['unexplained']} survive unexplained ({result['timeout']} of them ran out of time, which is no kill). "
         f"{result['tests']} tests, {result['properties']} of them properties of hypothesis."
     )
-    rows = [
-        f"| `{path}` | {counts['mutants']} | {counts.get('not run', 0)} | {counts.get('killed', 0)} | {counts.get('proved equivalent', 0)} | {_open(counts)} |"
-        for path, counts in result["files"].items()
-    ]
+    rows = [f"| `{path}` | {_row(counts)} |" for path, counts in result["files"].items()]
     return "\n".join(
         [text, "", "| file | mutants | not run | killed | proved equivalent | unexplained |", "|---|---|---|---|---|---|", *rows]
     )
 
 
-def _open(counts: dict[str, int]) -> int:
-    return counts.get("survived", 0) + counts.get("timeout", 0) - counts.get("proved equivalent", 0)
+def _row(counts: dict[str, int]) -> str:
+    proved = counts.get("proved equivalent", 0)
+    unexplained = counts.get("survived", 0) + counts.get("timeout", 0) - proved
+    figures = (counts["mutants"], counts.get("not run", 0), counts.get("killed", 0), proved, unexplained)
+    return " | ".join(map(str, figures))
 
 
 def crosscheck(result: dict[str, Any]) -> str:
