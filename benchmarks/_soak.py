@@ -1,7 +1,7 @@
 """The process whose memory is measured by `benchmarks.memory`: flight, safety and the policy runtime, nothing else.
 
-`python -m benchmarks._soak POLICY INPUTS MINUTES FOLDER` flies the ticks as fast as it can, writes the results and prints one
-JSON object.
+`python -m benchmarks._soak POLICY INPUTS MINUTES FOLDER RECORD` flies the ticks as fast as it can, writes the results and prints
+one JSON object. RECORD: 1 with the recorder on, as in flight; its chunks end by simulated time.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ import json
 import math
 import os
 import sys
+import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +21,13 @@ import numpy as np
 import flight.session  # noqa: F401  (everything that `fly` loads, the MAVSDK link included)
 from flight.flight_log import FlightLog
 from flight.rate_keeper import LatenessStatistics, RateStatistics
+from flight.recorder import Recorder
+from flight.recording_config import RecordingConfig
+from flight.recording_schema import FlightHeader, this_machine
 from flight.report import write_report
 from flight.scan_log import write_scans
 from flight.summary import build_summary, write_json_atomic
-from flight.tick import Pilot
+from flight.tick import Pilot, TickRecord
 from flight.trajectory import write_timing_csv, write_trajectory_csv
 from policy_export.runner import PolicyRunner
 from safety.config import Fence, SafetyConfig
@@ -67,6 +72,7 @@ def peak_mib() -> float:
 def main() -> None:
     """Command line, for the benchmark only."""
     policy, inputs, minutes, folder = Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3]), Path(sys.argv[4])
+    record = sys.argv[5] == "1"
     folder.mkdir(parents=True)
     ticks = round(minutes * 60.0 / TICK_S)
     runner = PolicyRunner.load(policy, rate_hz=1.0 / TICK_S)
@@ -76,32 +82,71 @@ def main() -> None:
     gc.collect()
     gc.freeze()
     gc.disable()
-    early_mib, late_mib = _fly(pilot, log, inputs, ticks)
+    clock = _Clock()
+    with _recorder(folder, runner, policy, clock) if record else nullcontext() as recorder:
+        resident = _fly(pilot, log, recorder, clock, inputs, ticks)
     gc.enable()
     _write_results(log, runner, folder)
     report = {
-        "early_mib": early_mib,
-        "late_mib": late_mib,
+        "resident_mib": resident,
         "peak_mib": peak_mib(),
         "minutes": len(log) * TICK_S / 60.0,
+        "recorded": recorder.recorded / ticks if recorder is not None else 1.0,
         "flown": sum(record.wanted is not None for record in log.records) / ticks,
         "foreign": [name for name in FOREIGN if name in sys.modules],
     }
     print(json.dumps(report))
 
 
-def _fly(pilot: Pilot, log: FlightLog, inputs: Path, ticks: int) -> tuple[float, float]:
-    """All ticks; gives the resident memory after a sixth of them and at the last one."""
-    early_mib = late_mib = math.nan
+def _header(runner: PolicyRunner, policy: Path) -> FlightHeader:
+    return FlightHeader(
+        mission="soak",
+        clock_offset_ns=0,
+        rate_hz=runner.metadata.rate_hz,
+        goal_m=(GOAL.x, GOAL.y, GOAL.z),
+        goal_radius_m=0.2,
+        safety=SafetyConfig(fence=FENCE),
+        policy_path=str(policy),
+        policy_sha256=runner.sha256,
+        dynamics="recorded",
+        machine=this_machine(),
+    )
+
+
+class _Clock:
+    """Simulated time, for the recorder."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def _recorder(folder: Path, runner: PolicyRunner, policy: Path, clock: _Clock) -> Recorder:
+    return Recorder(folder / "flight.mcap", _header(runner, policy), policy.read_bytes(), RecordingConfig(), clock=clock)
+
+
+def _fly(pilot: Pilot, log: FlightLog, recorder: Recorder | None, clock: _Clock, inputs: Path, ticks: int) -> list[float]:
+    """All ticks, no faster than the recorder writes them; gives the resident memory at every twelfth of the time."""
+    resident = []
     for k, (scan, state, now_s) in enumerate(samples(inputs, ticks)):
-        log.append(pilot.tick(scan, state, now_s), now_s + 0.001, 0.0001)
+        record = pilot.tick(scan, state, now_s)
+        log.append(record, now_s + 0.001, 0.0001)
         log.see(scan, state)
-        if k + 1 == ticks // 6:
-            early_mib = resident_mib()
-        if (k + 1) % (ticks // 6) == 0:
-            late_mib = resident_mib()
-            print(f"   {(k + 1) * TICK_S / 60.0:4.0f} min: {late_mib:.1f} MiB", file=sys.stderr, flush=True)
-    return early_mib, late_mib
+        if recorder is not None:
+            _record(recorder, k, record, scan, state)
+            clock.now_s = now_s
+        if (k + 1) % (ticks // 12) == 0:
+            resident.append(resident_mib())
+            print(f"   {(k + 1) * TICK_S / 60.0:4.0f} min: {resident[-1]:.2f} MiB", file=sys.stderr, flush=True)
+    return resident
+
+
+def _record(recorder: Recorder, k: int, record: TickRecord, scan: LidarScan, state: VehicleState) -> None:
+    recorder.tick(record, scan, state, record.sent, record.now_s + 0.001, GOAL, 0.0001)
+    while k - recorder.recorded - recorder.dropped > 20 and recorder.problem is None:
+        time.sleep(0.0005)
 
 
 def _write_results(log: FlightLog, runner: PolicyRunner, folder: Path) -> None:

@@ -71,9 +71,17 @@ def check(
 
 @app.command(epilog="Example:\n\nfly report runs/seed17")
 def report(folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The run folder of a flight.")]) -> None:
-    """Write report.html (and trajectory.png) of a flight into its folder, from what was recorded."""
+    """Write report.html of a flight into its folder. After a SIGKILL or a power cut, also what the flight could not write.
+
+    That is summary.json, trajectory.csv, timing.csv, scans.npz and trajectory.png, made from the recording in the folder
+    (flight.mcap, cut as it is, or flight-recovered.mcap). What is there is not replaced, but report.html.
+    """
+    from flight.broken_off import complete
     from flight.report import write_report
 
+    note = complete(folder)
+    if note is not None:
+        print(f"fly: {note}", file=sys.stderr)
     print(write_report(folder))
 
 

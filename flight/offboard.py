@@ -122,15 +122,14 @@ class OffboardFlight:
         """Fly until there is a reason to end. Raises nothing for what the vehicle or the policy does."""
         self._status.start_live(self._clock())
         try:
-            with quiet_interpreter():
-                self.stay()
-                self._align_with_scans()
-                while True:
-                    ending = self._step()
-                    if ending is not None:
-                        if not ending.in_control:
-                            self._link.close_stream()
-                        return ending
+            self.stay()
+            self._align_with_scans()
+            while True:
+                ending = self._step()
+                if ending is not None:
+                    if not ending.in_control:
+                        self._link.close_stream()
+                    return ending
         finally:
             self._status.stop_live()
 
@@ -283,7 +282,10 @@ class FlightJudge:
 
 @contextmanager
 def quiet_interpreter() -> Iterator[None]:
-    """No garbage collection in the loop (a full one takes 10 to 100 ms), and quick hand-over between threads."""
+    """No garbage collection in the loop, and quick hand-over between threads.
+
+    Enter it before OFFBOARD: the collection that it begins with takes 10 to 100 ms, in which no setpoint could be sent.
+    """
     interval = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()

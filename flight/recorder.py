@@ -1,7 +1,7 @@
 """The recorder: takes what each tick saw and did off the loop's hands, and writes it to an MCAP file on a thread of its own.
 
 The loop only puts a reference into a bounded queue: it never waits for encoding, disk or a viewer. When the queue is full (a
-disk that stands still) a tick is dropped and counted. Twice a second the writer ends its chunk and asks the disk to
+disk that stands still) a tick is dropped and counted. Every 0.8 s the writer ends its chunk and asks the disk to
 keep it, so that a power cut or a SIGKILL costs at most the last second (`fly recover` makes an indexed file of the rest).
 
 Nothing that goes wrong here ends a flight: recording stops, says so in one line, and the flight goes on.
@@ -34,8 +34,9 @@ log = logging.getLogger("flight.recorder")
 
 QUEUE_TICKS = 400
 """20 s at 20 Hz, about 1 MB: as long as a slow memory card may stand still."""
-FLUSH_EVERY_S = 0.5
-CHUNK_BYTES = 65_536
+FLUSH_EVERY_S = 0.8
+CHUNK_BYTES = 1 << 20
+"""Chunks end by time, not by size: each costs some 300 bytes of index in memory until the file is closed."""
 CLOSE_S = 5.0
 MIN_FREE_BYTES = 100 * 1024 * 1024
 
@@ -205,7 +206,7 @@ class Recorder:
             self._complain(f"recording incomplete: {_one_line(error)}")
 
     def _keep_safe(self) -> None:
-        """Every half second: end the chunk, let the disk keep it, look at size and space."""
+        """Every `FLUSH_EVERY_S`: end the chunk, let the disk keep it, look at size and space."""
         file = self._file
         if file is None or not file.due(self._clock()):
             return

@@ -28,8 +28,11 @@ from safety.frames import CorridorVector
 from safety.messages import LidarScan, VehicleState
 
 WORLD_FRAME, BODY_FRAME = "corridor", "vehicle"
-SCENE_EVERY_TICKS = 20
-"""Goal, fence and known obstacles come again every second, for a viewer that connects in flight."""
+SCENE_EVERY_TICKS = 200
+"""Goal, fence and known obstacles come again every ten seconds, for a viewer that connects in flight.
+
+Not oftener: with a twelfth topic, a chunk's index takes twice the memory (a second node of the writer's map).
+"""
 
 Quaternion = tuple[float, float, float, float]
 

@@ -1,13 +1,12 @@
 """`report.html`: one flight on one page that needs nothing else. No script, no network, no font, no other file.
 
-Everything comes from the run folder, so that a report can be made again at any time: `python -m flight.report FOLDER`.
+Everything comes from the run folder, so that a report can be made again at any time: `fly report FOLDER`.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import sys
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -15,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flight.errors import FlyError
 from flight.report_charts import (
     RANGE_COLOURS,
     SPEED_COLOURS,
@@ -35,7 +33,14 @@ from flight.svg import runs
 MAX_EVENTS = 200
 LATE_MS = 5.0
 _EVENT_GAP_TICKS = 10
-_GOOD = {"goal_reached": "good", "safety": "bad", "contact": "bad", "internal_error": "bad", "loop_stalled": "bad"}
+_GOOD = {
+    "goal_reached": "good",
+    "safety": "bad",
+    "contact": "bad",
+    "internal_error": "bad",
+    "loop_stalled": "bad",
+    "broken_off": "bad",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,21 +262,3 @@ def _keys(keys: list[tuple[str, str]]) -> str:
 def _scale(colours: tuple[str, ...], low: str, high: str) -> str:
     gradient = ",".join(colours)
     return f'<p class="scale">{escape(low)} <i style="background:linear-gradient(90deg,{gradient})"></i> {escape(high)}</p>'
-
-
-def main() -> int:
-    """`python -m flight.report FOLDER`."""
-    if len(sys.argv) != 2:
-        sys.stderr.write("usage: python -m flight.report FOLDER\n")
-        return 2
-    try:
-        path = write_report(Path(sys.argv[1]))
-    except FlyError as error:
-        sys.stderr.write(f"report: {error}\n")
-        return int(error.exit_code)
-    sys.stdout.write(f"{path}\n")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

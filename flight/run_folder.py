@@ -82,7 +82,7 @@ def read_run(folder: Path) -> Run:
         raise ReportError(f"{folder / 'trajectory.csv'} is missing or not a file of fly's: give a folder that fly has written")
     timing = _read_csv(folder / "timing.csv", TIMING_COLUMNS)
     truth_report = _read_json(folder / "gateway.json")
-    boxes = _table(truth_report.get("boxes"))
+    boxes = _table(truth_report.get("boxes") or summary.get("boxes_m"))
     return Run(
         summary=summary,
         ticks=ticks.columns,

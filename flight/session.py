@@ -27,7 +27,7 @@ from flight.lidar import LidarDriver, body_motion, open_lidar
 from flight.lidar.from_link import feed_from_link
 from flight.link import VehicleLink, check_port_is_free
 from flight.mission import Mission
-from flight.offboard import Ending, OffboardFlight
+from flight.offboard import Ending, OffboardFlight, quiet_interpreter
 from flight.preflight import (
     LOOP_RATE_HZ,
     Level,
@@ -291,10 +291,11 @@ class FlightSession:
 
     def _engage_and_run(self, flight: OffboardFlight) -> Ending:
         self._status.phase("height reached; switching to OFFBOARD")
-        flight.engage()
-        self._status.phase("the policy flies (Ctrl-C: brake, hold, land)")
-        self._recording.recorder.event("the policy flies")
-        return flight.run()
+        with quiet_interpreter():
+            flight.engage()
+            self._status.phase("the policy flies (Ctrl-C: brake, hold, land)")
+            self._recording.recorder.event("the policy flies")
+            return flight.run()
 
     def _pause(self, seconds: float) -> None:
         deadline = time.monotonic() + seconds

@@ -51,7 +51,6 @@ def _safety(mission: Mission, place: Place) -> SafetyConfig:
             "max_horizontal_speed_m_s": speed,
             "max_vertical_speed_m_s": climb,
             "max_yaw_rate_rad_s": min(safety.max_yaw_rate_rad_s, tether.max_yaw_rate_rad_s),
-            "blind_speed_m_s": min(safety.blind_speed_m_s, speed),
             "return_speed_m_s": back,
             "hold_off_speed_m_s": min(safety.hold_off_speed_m_s, back, climb),
         }

@@ -21,6 +21,7 @@ from safety.messages import VehicleState
 
 Floats = NDArray[np.float64]
 HISTORY = 64
+STANDSTILL_M_S = 0.1  # moving obstacles: slower than this counts as standing
 ZERO = CorridorVector(0.0, 0.0, 0.0)
 _Triple = tuple[float, float, float]
 
@@ -90,6 +91,10 @@ class Tubes:
     turn_m: Floats
     stop_m: Floats
 
+    def rows(self, chosen: slice | NDArray[np.intp]) -> Tubes:
+        """The tubes of some candidates."""
+        return Tubes(self.turn_m[:, chosen], self.stop_m[:, chosen])
+
 
 def predict_start(state: VehicleState, history: CommandHistory, now_s: float, config: SafetyConfig) -> Start:
     """Fly the estimate through the commands already sent, up to the moment at which a command sent now begins to act."""
@@ -157,3 +162,14 @@ def stop_gain_s(config: SafetyConfig) -> float:
         config.tick_s + (1.0 - math.exp(-config.tick_s / lag)) * (config.lag_s - lag) for lag in (config.lag_s, config.lag_min_s)
     )
     return max(gains)
+
+
+def slow_after_s(distance_m: Floats | float, config: SafetyConfig) -> Floats:
+    """Bound on the time from the begin of braking over a distance until the vehicle is slower than `STANDSTILL_M_S`, s.
+
+    A first-order lag is at the share 1 - exp(-t / tau) of its way after t, slower than w after tau ln(v / w). This bound is so
+    much longer that its share of the way is never ahead of the time: obstacles may be moved in proportion to the way.
+    """
+    faster = np.maximum(np.asarray(distance_m) / (config.lag_s * STANDSTILL_M_S), 1.0)
+    time_s: Floats = config.lag_s * (1.0 + np.log(faster))
+    return time_s

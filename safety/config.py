@@ -35,10 +35,10 @@ class Fence(_Frozen):
 
     min_m: Corner | None = None
     max_m: Corner | None = None
-    floor_m: float | None = Field(None, description="lowest z (corridor z, 0 = ground at the corridor's origin)")
-    ceiling_m: float | None = Field(None, description="highest z")
-    inclusion: Ring | None = Field(None, description="the polygon inside which the vehicle stays")
-    exclusion: tuple[Ring, ...] = Field((), description="polygons outside which it stays")
+    floor_m: float | None = Field(default=None, description="lowest z (corridor z, 0 = ground at the corridor's origin)")
+    ceiling_m: float | None = Field(default=None, description="highest z")
+    inclusion: Ring | None = Field(default=None, description="the polygon inside which the vehicle stays")
+    exclusion: tuple[Ring, ...] = Field(default=(), description="polygons outside which it stays")
 
     @property
     def polygon(self) -> Ring:
@@ -119,11 +119,10 @@ class SafetyConfig(_Frozen):
     state_stale_s: Positive = Field(0.2, description="a state estimate older than this is no estimate")
     future_tolerance_s: NotNegative = Field(0.02, description="a stamp this far ahead of the clock is still accepted")
 
-    blind_speed_m_s: NotNegative = Field(0.3, description="speed allowed into directions the LiDAR does not see")
     return_speed_m_s: Positive = Field(0.3, description="speed allowed while nearer than the margin or outside the fence")
     hold_off_speed_m_s: NotNegative = Field(0.25, description="speed out of a margin when drift, not a command, leads into it")
     fov_margin_rad: NotNegative = Field(0.1, description="this much of each edge of the field of view counts as unseen")
-    memory_s: NotNegative = Field(20.0, description="returns that left the field of view are remembered this long")
+    memory_s: NotNegative = Field(20.0, description="returns and free space that left the field of view are remembered this long")
     memory_hold_s: NotNegative = Field(0.12, description="a return is kept this long although newer scans look past it")
     ground_z_m: float = Field(0.0, description="corridor z of the ground; returns this low are the ground, not obstacles")
     monitors: MonitorConfig = Field(MonitorConfig.model_validate({}), description="thresholds of the monitors")
@@ -133,6 +132,11 @@ class SafetyConfig(_Frozen):
     def delay_s(self) -> float:
         """Total blind time T of the formulas: dead time, one tick of hold, and the lag of the velocity loop, s."""
         return self.dead_time_s + self.tick_s + self.lag_s
+
+    @property
+    def drift_m(self) -> float:
+        """How much further than estimated a vehicle comes until it stands when its velocity is off by the bound, per axis, m."""
+        return self.velocity_error_m_s * self.delay_s
 
     @property
     def keep_out_m(self) -> float:
@@ -145,13 +149,13 @@ class SafetyConfig(_Frozen):
         return self.vehicle_radius_m + self.position_error_m + self.margin_m
 
     def eroded_fence(self) -> PolygonFence:
-        """The fence as the vehicle's centre must keep to it: radius, position error and margin taken off by distance."""
-        slack_m = self.position_error_m + self.margin_m
+        """The fence as the vehicle's centre must keep to it: radius, errors of the estimate and margin taken off by distance."""
+        slack_m = self.position_error_m + self.drift_m + self.margin_m
         return polygon_fence(self.fence.polygon, self.fence.exclusion, self.vehicle_radius_m, slack_m)
 
     def keep_in_z(self) -> tuple[float, float]:
         """Lowest and highest z of the vehicle's centre, m."""
-        height = self.vehicle_half_height_m + self.position_error_m + self.margin_m
+        height = self.vehicle_half_height_m + self.position_error_m + self.drift_m + self.margin_m
         return self.fence.low_m[2] + height, self.fence.high_m[2] - height
 
     def stop_distance_m(self, speed_m_s: float) -> float:
@@ -162,7 +166,6 @@ class SafetyConfig(_Frozen):
     def _consistent(self) -> Self:
         for low, high in (
             ("lag_min_s", "lag_s"),
-            ("blind_speed_m_s", "max_horizontal_speed_m_s"),
             ("return_speed_m_s", "max_horizontal_speed_m_s"),
             ("hold_off_speed_m_s", "return_speed_m_s"),
             ("hold_off_speed_m_s", "max_vertical_speed_m_s"),

@@ -9,16 +9,20 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
+
 from safety.braking import CommandHistory, predict_start
 from safety.caps import cap_speed
 from safety.config import SafetyConfig
 from safety.frames import CorridorVector
+from safety.free_space import FreeSpace
 from safety.lidar import BeamTable, SeenScan, see
-from safety.limits import AT_REST, limit_command, sent_after
+from safety.limits import AT_REST, limit_command, sent_after, within_limits
 from safety.memory import ObstacleMemory
 from safety.messages import BRAKE, Health, Intervention, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
 from safety.monitors import REANCHORING, InputMonitor, Judgement
 from safety.shield import Decision, Shield, Surroundings
+from safety.sight import View
 
 MAX_GAP_TICKS = 2.0  # a longer gap between calls allows no larger step of the command
 GATE_SLACK = 1e-9  # rounding of the limits, relative
@@ -37,6 +41,7 @@ class SafetyFilter:
         self._monitor = InputMonitor(config)
         self._history = CommandHistory()
         self._memory = ObstacleMemory()
+        self._free = FreeSpace(config)
         self._table = BeamTable()
         self._shield = Shield(config)
         self._reach_m = config.stop_distance_m(2.0 * config.max_horizontal_speed_m_s) + config.keep_out_m + MEMORY_REACH_M
@@ -47,6 +52,7 @@ class SafetyFilter:
         self._monitor.reset()
         self._history.clear()
         self._memory.clear()
+        self._free.clear()
         self._last = AT_REST
         self._last_time_s: float | None = None
         self._seen: SeenScan | None = None
@@ -88,6 +94,7 @@ class SafetyFilter:
         judged = self._monitor.judge(command, state, scan, now_s, self._history, health)
         if any(fault.rule in REANCHORING for fault in judged.faults):
             self._memory.clear()
+            self._free.forget()
             self._seen = None
         if judged.faults or command is None or state is None or judged.scan is None:
             sent, verdict = _braked(*(judged.faults or (Intervention("input_missing", math.nan, math.nan),)))
@@ -103,9 +110,10 @@ class SafetyFilter:
     ) -> tuple[SafeCommand, Verdict]:
         """All inputs are fit: caps and limits, then the shield, then the gate."""
         capped, caps = cap_speed(command, judged.cap, self.config)
-        limited, limits = limit_command(capped, self._last, self._dt_s(now_s), scan.range_max_m, self.config)
+        dt_s = self._dt_s(now_s)
+        limited, limits = limit_command(capped, self._last, dt_s, scan.range_max_m, self.config)
         around = self._look(state, scan, now_s)
-        decision = self._shield.choose(limited.velocity, around)
+        decision = self._shield.choose(limited.velocity, around, lambda few: within_limits(few, self._last, dt_s, self.config))
         sent = SafeCommand(decision.velocity, limited.yaw_rate_rad_s)
         problem = gate_problem(sent, self.config)
         if problem is not None:
@@ -117,9 +125,10 @@ class SafetyFilter:
         if self._seen is None or scan.time_s > self._seen.time_s:
             self._seen = see(scan, state, self._table, self.config)
             self._memory.update(self._seen, self._reach_m, self.config)
+            self._free.update(self._seen)
         x, y, extra = self._memory.points(now_s, self.config)
         start = predict_start(state, self._history, now_s, self.config)
-        return Surroundings(x, y, extra, self._seen, state.position, state.yaw_rad, start)
+        return Surroundings(x, y, extra, View(self._free, np.array((x, y)), now_s), state.position, start)
 
     def _dt_s(self, now_s: float) -> float:
         """Time since the last command, bounded so that a pause allows no jump."""

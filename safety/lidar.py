@@ -21,6 +21,8 @@ MAX_BEAMS = 4096
 RANGE_SLACK_M = 0.1  # noise may carry a true return a little past range_max
 UNKNOWN_WINDOW_RAD = 0.26  # a bearing is unseen when too many beams within this on either side are unknown
 UNKNOWN_SHARE = 0.2
+TILT_BAND_M = 0.3  # a beam shows free space only while it is this near to the height of the LiDAR
+_LEVEL = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +30,8 @@ class SeenScan:
     """A scan placed in the corridor frame.
 
     `x_m`, `y_m`, `spread_m` [k]: returns, and half the width between neighbouring beams there. `range_m` [n]: horizontal distance
-    per beam, inf = free, nan = unknown. `unseen` [n]: bearings around which too much is unknown. Pose of the LiDAR at `time_s`.
+    per beam, inf = free, nan = unknown. `free_m` [n]: horizontal distance up to which a beam went through free space at the
+    height of the vehicle, nan = unknown. `unseen` [n]: bearings around which too much is unknown. Pose of the LiDAR at `time_s`.
     """
 
     time_s: float
@@ -41,7 +44,18 @@ class SeenScan:
     y_m: Floats
     spread_m: Floats
     range_m: Floats
+    free_m: Floats
     unseen: Booleans | None
+
+    @property
+    def beams(self) -> int:
+        """Number of beams."""
+        return int(self.range_m.shape[0])
+
+    @property
+    def all_round(self) -> bool:
+        """Whether the scan sees in all directions: then it has no edges."""
+        return self.beams * self.angle_increment_rad > 2.0 * math.pi - self.angle_increment_rad
 
 
 def scan_problem(scan: LidarScan) -> str | None:
@@ -98,6 +112,8 @@ def see(scan: LidarScan, state: VehicleState, table: BeamTable, config: SafetyCo
     yaw = state.yaw_rad - state.yaw_rate_rad_s * back_s
     ahead, left, up = _levelled(table, state.roll_rad, state.pitch_rad)
     ranges = clean_ranges(scan)
+    level = np.sqrt(ahead * ahead + left * left)
+    free = np.minimum(ranges, np.minimum(scan.range_max_m, TILT_BAND_M / np.maximum(np.abs(up), _LEVEL))) * level
     hit = np.isfinite(ranges)
     ground = hit & (z + np.where(hit, ranges, 0.0) * up < config.ground_z_m + config.ground_band_m)
     ranges[ground] = np.nan
@@ -107,7 +123,7 @@ def see(scan: LidarScan, state: VehicleState, table: BeamTable, config: SafetyCo
     return SeenScan(
         scan.time_s, x, y, yaw, scan.angle_min_rad, scan.angle_increment_rad,
         x + cos * dx - sin * dy, y + sin * dx + cos * dy, reach * (0.5 * scan.angle_increment_rad),
-        ranges * np.sqrt(ahead * ahead + left * left), _unseen(ranges, scan.angle_increment_rad),
+        ranges * level, free, _unseen(free, scan.angle_increment_rad),
     )  # fmt: skip
 
 
@@ -136,18 +152,3 @@ def scan_offset(seen: SeenScan, bearing_rad: Floats) -> Floats:
     half = 0.5 * seen.angle_increment_rad
     offset: Floats = np.remainder(bearing_rad - seen.angle_min_rad + half, 2.0 * math.pi) - half
     return offset
-
-
-def blind(seen: SeenScan, direction_rad: Floats, yaw_rad: float, config: SafetyConfig) -> Booleans:
-    """Which horizontal directions [c] (corridor frame, rad) no beam of this scan looks into."""
-    count = seen.range_m.shape[0]
-    offset = scan_offset(seen, direction_rad - yaw_rad)
-    if count * seen.angle_increment_rad > 2.0 * math.pi - seen.angle_increment_rad:  # sees all round: no edges
-        outside = np.zeros(direction_rad.shape, dtype=np.bool_)
-    else:
-        edge = config.fov_margin_rad - 0.5 * seen.angle_increment_rad
-        outside = (offset < edge) | (offset > (count - 1) * seen.angle_increment_rad - edge)
-    if seen.unseen is None:
-        return outside
-    beam = np.clip(np.rint(offset / seen.angle_increment_rad), 0, count - 1).astype(np.intp)
-    return outside | seen.unseen[beam]

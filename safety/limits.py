@@ -5,10 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from safety.config import SafetyConfig, speed_cap_m_s
 from safety.frames import CorridorVector
 from safety.messages import BRAKE, Intervention, VelocityCommand
 
+Floats = NDArray[np.float64]
 ROUNDING_M_S = 1e-9  # the time between two ticks is a difference of large numbers
 
 
@@ -43,6 +47,27 @@ def limit_command(
     if not found:
         return command, ()
     return VelocityCommand(velocity, yaw_rate), tuple(found)
+
+
+def within_limits(candidates_m_s: Floats, last: LastSent, dt_s: float, config: SafetyConfig) -> NDArray[np.bool_]:
+    """Which velocities [c, 3] may be sent `dt_s` after the last one: what evades an obstacle keeps to all limits too."""
+    added = candidates_m_s - _towards(candidates_m_s, last.velocity, 1.0)
+    change = added - _towards(added, last.acceleration, dt_s)
+    slow = np.hypot(candidates_m_s[:, 0], candidates_m_s[:, 1]) <= config.max_horizontal_speed_m_s + ROUNDING_M_S
+    level = np.abs(candidates_m_s[:, 2]) <= config.max_vertical_speed_m_s
+    grown = np.linalg.norm(added, axis=1) <= config.max_acceleration_m_s2 * dt_s + ROUNDING_M_S
+    within: NDArray[np.bool_] = slow & level & grown & (
+        np.linalg.norm(change, axis=1) <= config.max_jerk_m_s3 * dt_s * dt_s + ROUNDING_M_S
+    )  # fmt: skip
+    return within
+
+
+def _towards(points: Floats, end: CorridorVector, scale: float) -> Floats:
+    """The places nearest to points [c, 3] on the straight way from zero to `end` times `scale`."""
+    way = scale * np.array((end.x, end.y, end.z))
+    share = points @ way / max(float(way @ way), ROUNDING_M_S**2)
+    nearest: Floats = np.clip(share, 0.0, 1.0)[:, None] * way
+    return nearest
 
 
 def _limit_speed(velocity: CorridorVector, range_max_m: float, config: SafetyConfig, found: list[Intervention]) -> CorridorVector:

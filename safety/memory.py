@@ -15,6 +15,9 @@ from safety.lidar import SeenScan, scan_offset
 
 Floats = NDArray[np.float64]
 CAPACITY = 2048
+MOVED_S = (
+    1.0  # so long a point spreads at the obstacles' speed; after that the unseen that grows into the map of free space holds
+)
 SAME_PLACE_M = 0.2  # a return this close to a remembered one, along its beam, is the same thing seen again
 
 
@@ -74,4 +77,4 @@ class ObstacleMemory:
         x, y, spread, time_s = self._points[:, : self._count]
         age = np.maximum(now_s - time_s, 0.0)
         drift = np.minimum(age * config.velocity_error_m_s, config.position_error_m)
-        return x, y, spread + drift + age * config.obstacle_speed_m_s
+        return x, y, spread + drift + np.minimum(age, MOVED_S) * config.obstacle_speed_m_s

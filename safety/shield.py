@@ -6,39 +6,49 @@ does not pass, a fixed number of scaled, turned and projected ones are tried; if
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from safety.allowance import EPSILON_M, Allowance, allowance, held_in
-from safety.braking import Start, Tubes, tubes
+from safety.braking import Start, Tubes, slow_after_s, tubes
 from safety.config import SafetyConfig
 from safety.fence_tube import FenceGuard, NearFence
 from safety.frames import CorridorVector
-from safety.lidar import SeenScan, blind
 from safety.messages import Intervention
+from safety.sight import Hidden, Sight, View
 
 Floats = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
+Integers = NDArray[np.intp]
 SCALES = (0.8, 0.6, 0.4, 0.2, 0.1, 0.05)
 TURNS_RAD = tuple(math.radians(angle) for angle in (15.0, 30.0, 45.0, 60.0, 75.0, 85.0))
 PUSHES = (1.0, 1.5)  # candidates are shifted by these multiples of what leads out of a margin
+FIRST_LOOK = 8  # candidates nearest to the wanted command, judged before all others: one of them usually passes
 OUTWARD = (0.0, 0.1)  # slid candidates: this share of the wanted speed away from the obstacle
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What the shield knows this tick: obstacle points [k] with extra radius, the scan for the view, pose, start of control."""
+    """What the shield knows this tick: obstacle points [k] with extra radius, space seen free, place, start of control."""
 
     x_m: Floats
     y_m: Floats
     extra_m: Floats
-    seen: SeenScan
+    view: View
     position: CorridorVector
-    yaw_rad: float
     start: Start
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What braking sets for all commands of a tick: clearances and speeds, and the unseen space on its way."""
+
+    allowed: Allowance
+    hidden: Hidden
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,27 +66,40 @@ class Shield:
 
     def __init__(self, config: SafetyConfig) -> None:
         self._config = config
+        self._sight = Sight(config)
         self._guard = FenceGuard(config.eroded_fence(), *config.keep_in_z())
         directions = [(scale, 0.0) for scale in SCALES]
         directions += [(math.cos(turn), sign * turn) for turn in TURNS_RAD for sign in (1, -1)]
         self._scaled = np.array([(scale * math.cos(turn), scale * math.sin(turn)) for scale, turn in directions])
 
-    def choose(self, wanted: CorridorVector, around: Surroundings) -> Decision:
-        """The wanted velocity itself when it is safe (same object), else the nearest safe candidate, else zero."""
+    def choose(self, wanted: CorridorVector, around: Surroundings, within_limits: Callable[[Floats], Booleans]) -> Decision:
+        """The wanted velocity itself when it is safe (same object), else the nearest safe candidate, else zero.
+
+        `within_limits`: which of some candidates [c, 3] may be sent at all after the command sent last.
+        """
         reach = self._reach_m(around.start)
         near = self._guard.look(around.position, around.start, reach)
         clearance, fence_margin = self._clearance_now(around), near.room_m
         around = self._within_reach(around, reach)
+        limit = self._speed_limit(around, clearance, fence_margin)
         first = np.array(((wanted.x, wanted.y, wanted.z), (0.0, 0.0, 0.0)))
-        found: list[Intervention] = []
-        first[0] = self._view_capped(first[:1], around, clearance, fence_margin, found)[0]
-        passed, brake = self._judge(first, around, near, found)
-        if passed:
-            if not found:
-                return Decision(wanted, (), clearance, fence_margin)
+        speed = math.hypot(wanted.x, wanted.y)
+        found = [Intervention("return_speed", speed, limit)] if speed > limit else []
+        first = _capped(first, limit)
+        passed, bounds = self._judge(first, around, near, found)
+        if passed and not found:
+            return Decision(wanted, (), clearance, fence_margin)
+        if passed and within_limits(first[:1])[0]:
             return Decision(_vector(first[0]), tuple(found), clearance, fence_margin)
-        chosen = self._nearest(first[0], around, near, brake, clearance)
+        candidates = _capped(self._held_in(first[0], around, near, bounds.allowed), limit)
+        chosen = self._nearest(first[0], candidates[within_limits(candidates)], around, near, bounds)
         return Decision(_vector(chosen), tuple(found), clearance, fence_margin)
+
+    def _speed_limit(self, around: Surroundings, clearance_m: float, fence_margin_m: float) -> float:
+        """Horizontal speed allowed from here: less inside a margin, outside the fence or in space never seen, m/s."""
+        if clearance_m < self._config.margin_m or fence_margin_m < 0.0 or self._sight.lost(around.position, around.view):
+            return self._config.return_speed_m_s
+        return math.inf
 
     def _clearance_now(self, around: Surroundings) -> float:
         """Distance between the hull and the nearest known point, or as much as the sensor could have seen, m."""
@@ -93,7 +116,8 @@ class Shield:
             + config.max_horizontal_speed_m_s * config.tick_s / config.lag_min_s
         )
         apart = math.dist(start.position_m[0, :2], start.position_m[1, :2])
-        errors = config.velocity_error_m_s * config.delay_s + config.obstacle_speed_m_s * config.delay_s
+        blind_s = config.dead_time_s + config.tick_s + float(slow_after_s(fast * config.lag_s, config))
+        errors = config.velocity_error_m_s * config.delay_s + config.obstacle_speed_m_s * blind_s
         stop = config.stop_distance_m(fast + config.max_horizontal_speed_m_s * config.tick_s)
         return config.keep_out_m + apart + errors + stop
 
@@ -102,59 +126,65 @@ class Shield:
         start = around.start
         dx, dy = around.x_m - start.position_m[0, 0], around.y_m - start.position_m[0, 1]
         near = dx * dx + dy * dy < (reach_m + around.extra_m) ** 2
-        return dataclasses.replace(around, x_m=around.x_m[near], y_m=around.y_m[near], extra_m=around.extra_m[near])
+        x, y = around.x_m[near], around.y_m[near]
+        return Surroundings(x, y, around.extra_m[near], around.view.beside(np.array((x, y))), around.position, around.start)
 
-    def _view_capped(
-        self, candidates: Floats, around: Surroundings, clearance_m: float, fence_margin_m: float, found: list[Intervention]
-    ) -> Floats:
-        """Shorten horizontal vectors [c, 3] that point where nothing is seen, and all of them while inside a margin."""
-        config = self._config
-        speed = np.hypot(candidates[:, 0], candidates[:, 1])
-        unseen = blind(around.seen, np.arctan2(candidates[:, 1], candidates[:, 0]), around.yaw_rad, config)
-        limit = np.where(unseen, config.blind_speed_m_s, math.inf)
-        returning = clearance_m < config.margin_m or fence_margin_m < 0.0
-        if returning:
-            limit = np.minimum(limit, config.return_speed_m_s)
-        over = speed > limit
-        if not over.any():
-            return candidates
-        rule = "return_speed" if returning else "blind_speed"
-        found.append(Intervention(rule, float(speed[over][0]), float(limit[over][0])))
-        factor = np.where(over, limit / np.where(over, speed, 1.0), 1.0)
-        capped: Floats = candidates * np.stack((factor, factor, np.ones_like(factor)), axis=1)
-        return capped
-
-    def _judge(self, first: Floats, around: Surroundings, near: NearFence, found: list[Intervention]) -> tuple[bool, Allowance]:
-        """Judge the wanted command (row 0) against the allowance that braking (row 1) sets."""
+    def _judge(self, first: Floats, around: Surroundings, near: NearFence, found: list[Intervention]) -> tuple[bool, Bounds]:
+        """Judge the wanted command (row 0) against what braking (row 1) sets."""
         tube = tubes(around.start, first, self._config)
         clear, fence = self._tube_clearances(tube, around), self._guard.rooms_m(tube, around.start, near)
-        points, position = np.array((around.x_m, around.y_m)), np.array((around.position.x, around.position.y))
-        ways = self._guard.ways_out(tube, near) if (fence[1, :-2] < 0.0).any() else None
-        allowed = allowance(tube, clear[1], fence[1], points, position, ways, self._config)
-        passed = bool(allowed.permits(first[:1], clear[:1], fence[:1])[0])
-        if not passed:
+        position = np.array((around.position.x, around.position.y))
+        pressed = (fence[1, :-2] < 0.0).any() or (clear[1] < 0.0).any()
+        ways = self._guard.ways_out(tube, near) if pressed else None
+        allowed = allowance(tube, clear[1], fence[1], around.view.near_m, position, ways, self._config)
+        hidden = self._sight.hidden(tube, around.view)
+        bounds = Bounds(allowed, hidden.rows(slice(1, 2)))
+        if not allowed.permits(first[:1], clear[:1], fence[:1])[0]:
             found.extend(_reasons(allowed, first[0], clear[0], fence[0]))
-        return passed, allowed
+            return False, bounds
+        seen = self._sight.permitted(bounds.hidden, tube, hidden, allowed.brake_stop_m, around.view)
+        if not seen[0]:
+            found.append(Intervention("unseen", float(hidden.wide[0]), float(hidden.wide[1])))
+            return False, bounds
+        return True, bounds
 
-    def _nearest(self, wanted: Floats, around: Surroundings, near: NearFence, allowed: Allowance, clearance_m: float) -> Floats:
-        """Of all candidates that pass, the one nearest to the wanted vector [3]; zeros when none passes."""
+    def _held_in(self, wanted: Floats, around: Surroundings, near: NearFence, allowed: Allowance) -> Floats:
+        """All candidates [c, 3], turned along the fence, neither climbing nor sinking out of it."""
         brake = tubes(around.start, np.zeros((1, 3)), self._config)
-        candidates = held_in(self._candidates(wanted, around, allowed), self._guard.ways_out(brake, near), self._config)
-        candidates = self._view_capped(candidates, around, clearance_m, near.room_m, [])
+        candidates = held_in(
+            self._candidates(wanted, around, allowed), self._guard.ways_out(brake, near), allowed.push_m_s, self._config
+        )
         candidates[:, 2] = np.clip(candidates[:, 2], allowed.sink_m_s, allowed.climb_m_s)
+        return candidates
+
+    def _nearest(self, wanted: Floats, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Floats:
+        """Of the candidates [c, 3] that pass, the one nearest to the wanted vector [3]; when none passes, horizontally none."""
+        away = candidates - wanted
+        candidates = candidates[np.argsort(np.einsum("ci,ci->c", away, away), kind="stable")]
+        for few in (candidates[:FIRST_LOOK], candidates[FIRST_LOOK:]):
+            passed = self._passing(few, around, near, bounds)
+            if passed.shape[0]:
+                nearest: Floats = few[passed[0]]
+                return nearest
+        return bounds.allowed.hover_m_s
+
+    def _passing(self, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Integers:
+        """Indices of the candidates [c, 3] that keep to the bounds; unseen space is counted only for those that pass all else."""
         tube = tubes(around.start, candidates, self._config)
         rooms = self._guard.rooms_m(tube, around.start, near)
-        passed = allowed.permits(candidates, self._tube_clearances(tube, around), rooms)
-        away = candidates - wanted
-        cost = np.where(passed, np.einsum("ci,ci->c", away, away), math.inf)
-        best = int(np.argmin(cost))
-        return candidates[best] if passed[best] else np.zeros(3)
+        passed = np.flatnonzero(bounds.allowed.permits(candidates, self._tube_clearances(tube, around), rooms))
+        if passed.shape[0] == 0:
+            return passed
+        tube = tube.rows(passed)
+        hidden = self._sight.hidden(tube, around.view)
+        return passed[self._sight.permitted(bounds.hidden, tube, hidden, bounds.allowed.brake_stop_m, around.view)]
 
     def _candidates(self, wanted: Floats, around: Surroundings, allowed: Allowance) -> Floats:
         """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""
         x, y, z = wanted
         a, b = self._scaled[:, 0], self._scaled[:, 1]
-        rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], np.array([[0.0, 0.0, z]])]
+        still = np.array([[0.0, 0.0, z], [0.0, 0.0, 0.0]])
+        rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], still]
         if around.x_m.shape[0]:
             rows += [self._slid(wanted, around, stop) for stop in allowed.brake_stop_m]
         plain = np.concatenate(rows)
@@ -177,9 +207,12 @@ class Shield:
         """Smallest distance beyond keep-out between each tube and each known point, [c, k], m."""
         config, error = self._config, self._config.velocity_error_m_s
         # the way from begin to turn is one tick long: begin is past choosing, turn is judged as the leg's begin
-        turned = error * (config.dead_time_s + config.tick_s)
-        stopped = turned + error * config.lag_s + config.obstacle_speed_m_s * config.delay_s
-        return _leg_clearances(tube.turn_m, tube.stop_m, turned, stopped, around) - config.keep_out_m
+        turned = (error + config.obstacle_speed_m_s) * (config.dead_time_s + config.tick_s)
+        grown: Floats | float = error * config.lag_s
+        if config.obstacle_speed_m_s > 0.0:
+            leg = tube.stop_m - tube.turn_m
+            grown = grown + config.obstacle_speed_m_s * slow_after_s(np.hypot(leg[..., 0], leg[..., 1]), config).reshape(-1, 1)
+        return _leg_clearances(tube, turned, grown, around) - config.keep_out_m
 
 
 def _reasons(allowed: Allowance, wanted: Floats, clear_m: Floats, fence_m: Floats) -> list[Intervention]:
@@ -199,8 +232,12 @@ def _reasons(allowed: Allowance, wanted: Floats, clear_m: Floats, fence_m: Float
     return reasons
 
 
-def _leg_clearances(begin_m: Floats, end_m: Floats, error_begin_m: float, error_end_m: float, around: Surroundings) -> Floats:
-    """Smallest distance from straight legs [2 models, c, 3] to the points, less errors that grow along the leg, [c, k], m."""
+def _leg_clearances(tube: Tubes, error_m: float, grown_m: Floats | float, around: Surroundings) -> Floats:
+    """Smallest distance from the tubes' straight legs to the points, less errors that grow along the leg, [c, k], m.
+
+    `error_m`: at the leg's begin; `grown_m`: added at its end, one for all or [2 models x c, 1].
+    """
+    begin_m, end_m = tube.turn_m, tube.stop_m
     ax, ay = begin_m[..., 0].reshape(-1, 1), begin_m[..., 1].reshape(-1, 1)
     dx, dy = end_m[..., 0].reshape(-1, 1) - ax, end_m[..., 1].reshape(-1, 1) - ay
     rx, ry = around.x_m - ax, around.y_m - ay
@@ -210,11 +247,21 @@ def _leg_clearances(begin_m: Floats, end_m: Floats, error_begin_m: float, error_
     ry -= along * dy
     distance = np.sqrt(rx * rx + ry * ry)
     distance -= around.extra_m
-    along *= error_end_m - error_begin_m
+    along *= grown_m
     distance -= along
     slow, fast = distance.reshape(*begin_m.shape[:2], around.x_m.shape[0])
-    nearest: Floats = np.minimum(slow, fast) - error_begin_m
+    nearest: Floats = np.minimum(slow, fast) - error_m
     return nearest
+
+
+def _capped(candidates: Floats, limit_m_s: float) -> Floats:
+    """Velocities [c, 3] whose horizontal part is shortened to a limit."""
+    speed = np.hypot(candidates[:, 0], candidates[:, 1])
+    if not (speed > limit_m_s).any():
+        return candidates
+    shorter = candidates.copy()
+    shorter[:, :2] *= (limit_m_s / np.maximum(speed, limit_m_s))[:, None]
+    return shorter
 
 
 def _vector(values: Floats) -> CorridorVector:

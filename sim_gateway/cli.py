@@ -123,7 +123,7 @@ def serve(
 
 def _serve(world: World, config: GatewayConfig, quit_with_parent: bool) -> None:
     from sim_gateway.gateway import Gateway, warm_up
-    from sim_gateway.mavlink_server import PortInUseError
+    from sim_gateway.mavlink_links import PortInUseError
     from sim_gateway.scip import ScipServerError
 
     stop = threading.Event()

@@ -56,6 +56,14 @@ class EstimateNoise:
             if any(not math.isfinite(v) or v < 0.0 or (is_time and v == 0.0) for v in values):
                 raise ValueError(f"{item.name} is {values}: give finite values {'above' if is_time else 'not below'} 0")
 
+    @staticmethod
+    def held(attitude_bias_rad: Triple = (0.0, 0.0, 0.0)) -> EstimateNoise:
+        """Errors that stay as they are put, for a driver that sets them itself (`Simulation.disturb`)."""
+        for_ever = (1e9, 1e9, 1e9)
+        return EstimateNoise(
+            attitude_rad=attitude_bias_rad, position_time_s=for_ever, velocity_time_s=for_ever, attitude_time_s=for_ever
+        )
+
     def as_array(self) -> Array:
         """The row that the kernels read: float64 [ESTIMATE_PARAM_SIZE]."""
         parts = (

@@ -22,6 +22,7 @@ from sim_gateway.lidar import LidarConfig
 from sim_gateway.link_faults import LinkFaults
 from sim_gateway.mavlink_links import UdpLink
 from sim_gateway.mavlink_server import MavlinkServer
+from sim_gateway.pace import Pace
 from sim_gateway.piloted import PilotedVehicle
 from sim_gateway.report_faults import ReportFaults
 from sim_gateway.scene import Point, World
@@ -33,7 +34,7 @@ from sim_gateway.vehicle import STEP_S
 
 # distance from the port a client listens on to the gateway's own port, as in PX4's SITL (14580 - 14540, 18570 - 14550)
 ONBOARD_PORT_OFFSET, GROUND_PORT_OFFSET = 40, 4020
-_GIVE_UP_BACKLOG_S = 0.5
+_TELL_EVERY_S = 0.2
 _MAX_STEPS_PER_TURN = 25
 _LONGEST_WAIT_S = 0.02
 
@@ -107,8 +108,9 @@ class Gateway:
             self.vehicle.simulation.inject(fault)
         self.carry: Callable[[float], tuple[Point, float]] | None = None
         self.alter_scan: Callable[[NDArray[np.float32]], NDArray[np.float32] | None] | None = None
-        self.lidar = ScipServer(lambda: self.vehicle.time_s, config.lidar_port)
-        self.dropped_s = 0.0
+        self.lidar = ScipServer(lambda: self.device_time_s, config.lidar_port)
+        self.pace = Pace(config.speed, time.monotonic())
+        self._told_s = 0.0
         self._started_s = math.nan
         self._scans = 0
         self._was_armed = False
@@ -150,20 +152,27 @@ class Gateway:
 
     def run(self, stop: threading.Event) -> None:
         """Pace vehicle time to the clock until `stop` is set or `max_time_s` of vehicle time is over, then write the report."""
-        self._started_s = origin_s = time.monotonic()
-        speed = self.config.speed
+        self._started_s = time.monotonic()
+        self.pace = Pace(self.config.speed, self._started_s)
         while not stop.is_set() and self.vehicle.time_s < self.config.max_time_s:
-            behind_s = (time.monotonic() - origin_s) * speed - self.vehicle.time_s
-            if behind_s > _GIVE_UP_BACKLOG_S * speed:
-                origin_s += behind_s / speed
-                self.dropped_s += behind_s / speed
-                _log.warning("%.2f s behind the clock: vehicle time stood still for that long", behind_s / speed)
-                behind_s = 0.0
+            behind_s = self.pace.behind_s(time.monotonic(), self.vehicle.time_s)
+            self._tell_dropped()
             for _ in range(min(int(behind_s / STEP_S), _MAX_STEPS_PER_TURN)):
                 self.step()
-            due_s = origin_s + (self.vehicle.simulation.steps + 1) * STEP_S / speed
+            due_s = self.pace.due_s((self.vehicle.simulation.steps + 1) * STEP_S)
             self._wait(due_s - time.monotonic())
         self.write_report()
+
+    @property
+    def device_time_s(self) -> float:
+        """What the LiDARs' own clocks show: they run on while vehicle time stands still."""
+        return self.vehicle.time_s + self.pace.dropped_s * self.config.speed
+
+    def _tell_dropped(self) -> None:
+        dropped_s = self.pace.dropped_s
+        if dropped_s - self._told_s >= _TELL_EVERY_S:
+            _log.warning("this computer is too slow: vehicle time stood still for %.2f s so far", dropped_s)
+            self._told_s = dropped_s
 
     def _wait(self, seconds: float) -> None:
         """Sleep until the next step is due; what arrives meanwhile is handled at once."""
@@ -181,20 +190,21 @@ class Gateway:
             vehicle.simulation.carry(*self.carry(vehicle.time_s))
         vehicle.advance(1)
         self.recorder.watch()
+        ahead_s = self.device_time_s - vehicle.time_s
         if self.serial_lidar is not None:
-            self.serial_lidar.advance(vehicle.simulation)
+            self.serial_lidar.advance(vehicle.simulation, ahead_s)
         if vehicle.simulation.steps >= step_at(self._scans * 0.05):
             self._scans += 1
             for scan in vehicle.simulation.device_scans():
-                self._publish(scan)
+                self._publish(scan, ahead_s)
         self.incidents.step()
         self.server.poll()
         self._note_changes()
 
-    def _publish(self, scan: Scan) -> None:
+    def _publish(self, scan: Scan, ahead_s: float) -> None:
         ranges = self.alter_scan(scan.ranges_m) if self.alter_scan is not None else scan.ranges_m
         if ranges is not None:
-            self.lidar.publish(scan.time_s, ranges)
+            self.lidar.publish(scan.time_s + ahead_s, ranges)
             self.telemetry.scan = replace(scan, ranges_m=ranges)
 
     def _note_changes(self) -> None:
@@ -214,7 +224,7 @@ class Gateway:
             return
         elapsed_s = max(time.monotonic() - self._started_s, 1e-9)
         factor = round(self.vehicle.time_s / elapsed_s, 4)
-        content = self.recorder.as_dict(real_time_factor=factor, dropped_s=round(self.dropped_s, 3))
+        content = self.recorder.as_dict(real_time_factor=factor, dropped_s=round(self.pace.dropped_s, 3))
         content["received"] = self._received()
         content["setpoints"] = self._setpoints()
         content["faults"] = [
@@ -229,7 +239,7 @@ class Gateway:
     def _received(self) -> list[dict[str, Any]]:
         """What moved, armed or configured the vehicle came over the wire: kind, sender, how often, first and last time."""
         found: dict[tuple[str, tuple[int, int]], list[float]] = {}
-        for item in self.server.wire_log:
+        for item in self.server.wire_log.entries:
             found.setdefault((item.what, item.sender), []).append(round(item.time_s, 3))
         return [
             {"what": what, "from": f"{sender[0]}/{sender[1]}", "count": len(times), "first_s": times[0], "last_s": times[-1]}
@@ -238,7 +248,7 @@ class Gateway:
 
     def _setpoints(self) -> dict[str, Any]:
         """The newest velocity setpoints as they arrived: vehicle time, NED m/s, clockwise rad/s, sender."""
-        log = [item for item in self.server.wire_log if item.velocity is not None]
+        log = [item for item in self.server.wire_log.entries if item.velocity is not None]
         rows = [[round(item.time_s, 3), *(round(v, 5) for v in item.velocity or ()), *item.sender] for item in log]
         return {"columns": ["t", "north", "east", "down", "yaw_rate", "system", "component"], "rows": rows}
 

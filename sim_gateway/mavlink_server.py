@@ -1,16 +1,13 @@
-"""MAVLink 2 over UDP on loopback: parses what clients send, streams telemetry, answers commands and parameters.
+"""The vehicle's MAVLink side: hands each message to who answers it, streams telemetry, answers parameters and setpoints.
 
-Two links as in PX4's SITL: onboard (14580 -> 14540) and ground station (18570 -> 14550). Each sends to its default client port
-and to every loopback address that has spoken to it lately. Nothing blocks; everything that could grow is bounded.
+Two links as in PX4's SITL: onboard (14580 -> 14540) and ground station (18570 -> 14550), see `mavlink_links`.
 """
 
 from __future__ import annotations
 
 import logging
-import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import development as mav
 
@@ -19,11 +16,14 @@ from sim_gateway.commands import Command, CommandHandler
 from sim_gateway.fence import FENCE, FenceStore
 from sim_gateway.flight_modes import FlightMode, Result
 from sim_gateway.local_frame import LocalFrame
+from sim_gateway.log_server import LogServer
 from sim_gateway.mavlink_links import MavlinkLink, PortInUseError, UdpLink
 from sim_gateway.parameters import HASH_INDEX, HASH_NAME, UINT32, ParameterStore
 from sim_gateway.setpoints import NAN, NOTHING, SetpointRefusedError, read_setpoint
 from sim_gateway.sticks import from_manual_control
 from sim_gateway.telemetry import COMPONENT_ID, GROUND, ONBOARD, SYSTEM_ID, Message, Telemetry
+from sim_gateway.vehicle_log import VehicleLog
+from sim_gateway.wire_log import WireLog
 
 ONBOARD_PORTS = (14580, 14540)  # own port, client's port
 GROUND_PORTS = (18570, 14550)
@@ -31,39 +31,7 @@ _PARAMS_PER_POLL = 5
 _GLOBAL_FRAMES = (0, 5, 3, 6)  # absolute and relative altitude
 _RELATIVE_FRAMES = (3, 6)
 
-_WIRE_LOG = 20_000  # a quarter of an hour of setpoints at 20 Hz
-_WIRE_SENDERS = 1_000  # kinds of message and sender that are counted
-_COMMANDS_LOGGED = {
-    mav.MAV_CMD_DO_SET_MODE: "DO_SET_MODE",
-    mav.MAV_CMD_COMPONENT_ARM_DISARM: "ARM_DISARM",
-    mav.MAV_CMD_NAV_TAKEOFF: "NAV_TAKEOFF",
-    mav.MAV_CMD_NAV_LAND: "NAV_LAND",
-    mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: "NAV_RETURN_TO_LAUNCH",
-    mav.MAV_CMD_DO_REPOSITION: "DO_REPOSITION",
-}
-_SETPOINTS_LOGGED = (
-    "SET_POSITION_TARGET_LOCAL_NED",
-    "SET_POSITION_TARGET_GLOBAL_INT",
-    "SET_ATTITUDE_TARGET",
-    "SET_ACTUATOR_CONTROL_TARGET",
-    "SET_MODE",
-    "PARAM_SET",
-)
-
 _log = logging.getLogger("sim_gateway.mavlink")
-
-
-@dataclass(frozen=True, slots=True)
-class Received:
-    """One message that moves, arms or configures the vehicle, as it came off the wire. `what`: message or command name.
-
-    `velocity`: of a local velocity setpoint, NED m/s and clockwise rad/s.
-    """
-
-    time_s: float
-    what: str
-    sender: tuple[int, int]
-    velocity: tuple[float, float, float, float] | None = None
 
 
 class MavlinkServer:
@@ -86,8 +54,9 @@ class MavlinkServer:
         self._shown_mode: tuple[FlightMode, FlightMode] | None = None
         self._shown_landed = -1
         self.fence = FenceStore(self._now)
-        self.counts: Counter[tuple[str, int, int]] = Counter()
-        self.wire_log: deque[Received] = deque(maxlen=_WIRE_LOG)
+        self.vehicle_log = VehicleLog(autopilot)
+        self._log_server = LogServer(self.vehicle_log)
+        self.wire_log = WireLog(self._now)
         self._handlers: dict[str, Callable[[Message, MavlinkLink], None]] = {
             "HEARTBEAT": self._on_heartbeat,
             "COMMAND_LONG": self._on_command_long,
@@ -104,6 +73,10 @@ class MavlinkServer:
             "MISSION_ITEM_INT": self._on_fence_message(self.fence.on_item),
             "MISSION_REQUEST_INT": self._on_fence_message(self.fence.on_request),
             "MISSION_ACK": self._on_fence_message(self.fence.on_ack),
+            "LOG_REQUEST_LIST": lambda m, link: self._log_server.on_list(m, link.send),
+            "LOG_REQUEST_DATA": lambda m, link: self._log_server.on_data(m, link.send),
+            "LOG_REQUEST_END": lambda m, link: self._log_server.on_end(m, link.send),
+            "LOG_ERASE": lambda m, link: self._log_server.on_erase(m, link.send),
             "MANUAL_CONTROL": self._on_manual_control,
             "TIMESYNC": self._on_timesync,
             "PING": self._on_ping,
@@ -134,6 +107,8 @@ class MavlinkServer:
             for message in link.receive():
                 self._dispatch(message, link)
         self._send_changes()
+        self.vehicle_log.watch()
+        self._log_server.poll()
         for link in self.links:
             self.fence.poll(link.send)
             for name in link.due(self._telemetry.available):
@@ -161,21 +136,12 @@ class MavlinkServer:
     def _dispatch(self, message: Message, link: MavlinkLink) -> None:
         if message.get_srcSystem() == SYSTEM_ID or getattr(message, "target_system", 0) not in (0, SYSTEM_ID):
             return
-        self._count(message)
+        self.wire_log.note(message)
         handler = self._handlers.get(message.get_type())
         if handler is None:
             return
         if getattr(message, "target_component", 0) in (0, COMPONENT_ID):
             handler(message, link)
-
-    def _count(self, message: Message) -> None:
-        """Count by kind and sender; log what moves, arms or configures the vehicle."""
-        name, sender = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
-        if (name, *sender) in self.counts or len(self.counts) < _WIRE_SENDERS:
-            self.counts[name, *sender] += 1
-        command = _COMMANDS_LOGGED.get(message.command) if name in ("COMMAND_LONG", "COMMAND_INT") else None
-        if name in _SETPOINTS_LOGGED or command is not None:
-            self.wire_log.append(Received(self._now(), command or name, sender, _velocity(message, name)))
 
     def _on_manual_control(self, m: Message, _: MavlinkLink) -> None:
         """A joystick. Its target field is a system id of its own name."""
@@ -320,14 +286,6 @@ class MavlinkServer:
     def _on_ping(self, m: Message, link: MavlinkLink) -> None:
         if m.target_system == 0 and m.target_component == 0:
             link.send(mav.MAVLink_ping_message(m.time_usec, m.seq, m.get_srcSystem(), m.get_srcComponent()))
-
-
-def _velocity(m: Message, name: str) -> tuple[float, float, float, float] | None:
-    """What a velocity setpoint asks for; None for other messages and for what is not finite."""
-    if name != "SET_POSITION_TARGET_LOCAL_NED":
-        return None
-    values = (m.vx, m.vy, m.vz, m.yaw_rate)
-    return values if all(map(math.isfinite, values)) else None
 
 
 def _is_pilot(message: Message) -> bool:

@@ -71,7 +71,9 @@ class ScanFaults:
 
 
 def _bearings(scan: Scan) -> NDArray[np.float64]:
-    bearings: NDArray[np.float64] = scan.angle_min_rad + scan.angle_increment_rad * np.arange(scan.ranges_m.size)
+    bearings: NDArray[np.float64] = scan.angle_min_rad + scan.angle_increment_rad * np.arange(
+        scan.ranges_m.size, dtype=np.float64
+    )
     return bearings
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -37,11 +38,15 @@ class SerialLidar:
         self.port = PtyPort(link)
         self.path = self.port.path
 
-    def advance(self, simulation: Simulation) -> None:
-        """Answer the client and send what the beams fired since the last call have seen."""
+    def advance(self, simulation: Simulation, ahead_s: float = 0.0) -> None:
+        """Answer the client and send what the beams fired since the last call have seen.
+
+        `ahead_s`: the device's clock less vehicle time.
+        """
         heard = self.port.read()
         answers = self.device.handle(heard) if heard else b""
-        self.port.write(answers + self.device.take(self.scanner.fire(simulation)))
+        shots = self.scanner.fire(simulation)
+        self.port.write(answers + self.device.take(replace(shots, time_s=shots.time_s + ahead_s)))
 
     def close(self) -> None:
         """Take the line away."""

@@ -164,7 +164,7 @@ def _read_motion(state: Array, error: Array, acceleration_error: Array, out: Arr
 class SensorNoise:
     """Random numbers of one sensor: counter-based, so that those of a time do not depend on what was read before."""
 
-    def __init__(self, key: NDArray[np.uint64]) -> None:
+    def __init__(self, key: NDArray[np.unsignedinteger]) -> None:
         self._bits = np.random.Philox(key=key)
         self._generator = np.random.Generator(self._bits)
         self._fresh = self._bits.state
@@ -269,6 +269,15 @@ class Simulation:
         state[POS : POS + 3], state[VEL : VEL + 3] = position_m, velocity_m_s
         state[QUAT : QUAT + 4] = (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
         state[OMEGA : OMEGA + 3] = 0.0
+
+    def disturb(self, position_m: Sequence[float], velocity_m_s: Sequence[float], wind_m_s: Sequence[float]) -> None:
+        """Put the estimate's errors and the steady wind where an adversary wants them (corridor frame), from the next step on.
+
+        They stay only where nothing random moves them: `EstimateNoise.held()` and no gusts.
+        """
+        self._error[POSITION_ERROR : POSITION_ERROR + 3] = position_m
+        self._error[VELOCITY_ERROR : VELOCITY_ERROR + 3] = velocity_m_s
+        self._wind_mean[:] = wind_m_s
 
     def advance_motors_off(self, n_steps: int) -> None:
         """Let `n_steps` of 4 ms pass with the motors off: at rest on the ground, falling in the air."""

@@ -115,8 +115,8 @@ class Air:
         while self.uplink and self.uplink[0][0] <= self.time_s:
             self.link.inbox.append(self.uplink.popleft()[1])
         self.server.poll()
-        while self.server.wire_log:
-            item = self.server.wire_log.popleft()
+        while self.server.wire_log.entries:
+            item = self.server.wire_log.entries.popleft()
             if item.velocity is not None:
                 north, east, down, yaw_rate = item.velocity
                 self.setpoints.append(Setpoint(item.time_s, (north, east, down), yaw_rate, item.sender[1]))

@@ -37,7 +37,7 @@ Attempt = Callable[[int, Path, Path], str | None]
 
 @dataclass(frozen=True, slots=True)
 class GroundEntry:
-    """`attempt(variant, folder, policy)`: what was said, None when it was accepted. `names`: what that must speak of, per variant."""
+    """`attempt(variant, folder, policy)`: what was said, None when accepted. `names`: what that must speak of, per variant."""
 
     id: str
     title: str

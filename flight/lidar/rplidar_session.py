@@ -5,7 +5,8 @@ from __future__ import annotations
 import struct
 
 from flight.lidar import rplidar
-from flight.lidar.rplidar import Answer, RplidarError
+from flight.lidar.rplidar import Answer, RplidarError, format_name
+from flight.lidar.rplidar_decoders import CapsuleDecoder, StandardDecoder
 from flight.lidar.serial_port import SerialTransport
 from flight.lidar.session import POLL_S, Host
 from flight.lidar.spinning_session import StreamKind
@@ -43,7 +44,8 @@ class RplidarStarter:
         command = rplidar.request(rplidar.SCAN) if standard else rplidar.express_request(mode or 0)
         answer = self._ask(command, "the scan command")
         if answer.kind != kind:
-            raise RplidarError(f"asked for scan format {kind:02X}, the LiDAR sends {answer.kind:02X}: set lidar.rplidar_mode")
+            sent = format_name(answer.kind)
+            raise RplidarError(f"asked for scan format {format_name(kind)}, the LiDAR sends {sent}: set lidar.rplidar_mode")
         name = f"RPLIDAR model {info.model:02X}, firmware {info.firmware[0]}.{info.firmware[1]:02d}, format {kind:02X}"
         frame_bytes = rplidar.NODE_BYTES if kind == rplidar.STANDARD else rplidar.CAPSULE_BYTES
         return StreamKind(name, _decoder(kind, sample_s), RANGE_MIN_M, far_m, frame_bytes, first_bytes=self._reader.rest)
@@ -129,8 +131,10 @@ def _pick(kinds: dict[int, int], typical: int, wanted: str) -> int:
         fitting = [mode for mode, offered in kinds.items() if offered == kind]
         if fitting:
             return typical if typical in fitting else fitting[-1]
-    offered = ", ".join(sorted({f"{kind:02X}" for kind in kinds.values()}))
-    raise RplidarError(f"this LiDAR offers the formats {offered or 'none'}, none of them is {wanted}: set lidar.rplidar_mode")
+    offered = ", ".join(sorted({format_name(kind) for kind in kinds.values()})) or "none"
+    if not set(kinds.values()) & set(rplidar.READABLE):
+        raise RplidarError(f"this LiDAR offers the formats {offered}; standard, express or dense is needed")
+    raise RplidarError(f"this LiDAR offers the formats {offered}, none of them is {wanted}: set lidar.rplidar_mode")
 
 
 def _sample_s(microseconds: float) -> float:
@@ -139,7 +143,7 @@ def _sample_s(microseconds: float) -> float:
     return 1e-6 * microseconds
 
 
-def _decoder(kind: int, sample_s: float) -> rplidar.StandardDecoder | rplidar.CapsuleDecoder:
+def _decoder(kind: int, sample_s: float) -> StandardDecoder | CapsuleDecoder:
     if kind == rplidar.STANDARD:
-        return rplidar.StandardDecoder(sample_s)
-    return rplidar.CapsuleDecoder(sample_s, dense=kind == rplidar.DENSE)
+        return StandardDecoder(sample_s)
+    return CapsuleDecoder(sample_s, dense=kind == rplidar.DENSE)

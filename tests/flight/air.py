@@ -112,7 +112,7 @@ class Air:
 
     def received(self, since_s: float = -math.inf) -> list[tuple[float, str]]:
         """What `fly` sent that moves, arms or configures, as it arrived at the vehicle: (vehicle time, what)."""
-        log = tuple(self.gateway.server.wire_log)
+        log = tuple(self.gateway.server.wire_log.entries)
         return [(item.time_s, item.what) for item in log if item.sender in FLY and item.time_s > since_s]
 
     def put_back(self) -> None:

@@ -7,6 +7,7 @@ import math
 import resource
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,20 @@ from flight.checks.computer import (
 )
 from flight.checks.facts import VehicleFacts
 from flight.checks.hand_motion import HandTest
+from flight.checks.lidar import check_coverage
 from flight.checks.parameters import READ_ALSO, RULES, Needs, corrections, judge_parameters
 from flight.checks.vehicle import check_position, check_version
 from flight.fence_outline import cuts_into
 from flight.fence_upload import VERTEX_INCLUSION, FenceClient, FenceVertex, GeoPoint, outer_fence
+from flight.lidar import LidarHealth
 from flight.link import VehicleLink
 from flight.mission import load_mission
-from flight.preflight import Check, Level
+from flight.preflight import Check, Level, check_lidar
 from flight.preparation import Place, anchor_frame, resolve_place
+from policy_export.contract import PolicyMetadata
+from policy_export.runner import PolicyRunner
 from safety.frames import CorridorFrame, CorridorVector, NedVector
+from safety.messages import LidarScan
 
 QUICK = Pace(listen_s=0.3, settle_s=0.8, rest_samples=6, scans=6)
 # parameter: (wrong value, level that it must get on a real vehicle, what the advice must say)
@@ -160,6 +166,7 @@ def setting(**fields: Any) -> Callable[[Any], None]:
 VEHICLE_FAULTS: dict[str, tuple[str, Callable[[Any], None] | None, str, Level, str, str]] = {
     "accelerometer": ("SYS_STATUS", bits(0x2), "health", Level.FAIL, "unhealthy: accelerometer", "calibration"),
     "gyro": ("SYS_STATUS", bits(0x1), "health", Level.FAIL, "gyro", "calibration"),
+    "magnetometer": ("SYS_STATUS", bits(0x4), "health", Level.FAIL, "magnetometer", "calibration"),
     "barometer": ("SYS_STATUS", bits(0x8), "health", Level.FAIL, "barometer", "wiring"),
     "pre-arm": ("SYS_STATUS", bits(0x10000000), "pre-arm", Level.FAIL, "refuse to arm", "commander check"),
     "battery": ("SYS_STATUS", setting(battery_remaining=12), "battery", Level.FAIL, "12%", "charge it"),
@@ -167,9 +174,15 @@ VEHICLE_FAULTS: dict[str, tuple[str, Callable[[Any], None] | None, str, Level, s
     "no position": ("ESTIMATOR_STATUS", setting(flags=0x27), "local position", Level.FAIL, "horizontal position", "optical flow"),
     "dead reckoning": ("ESTIMATOR_STATUS", setting(flags=0x3BF), "local position", Level.FAIL, "aiding", "GPS"),
     "vague": ("ESTIMATOR_STATUS", setting(pos_horiz_accuracy=2.0), "local position", Level.WARN, "2.00 m", "fence"),
+    "GPS glitch": ("ESTIMATOR_STATUS", setting(flags=0x73F), "local position", Level.FAIL, "GPS glitch", "GPS fix"),
     "estimator silent": ("ESTIMATOR_STATUS", None, "local position", Level.FAIL, "no ESTIMATOR_STATUS", "companion link"),
     "runs away": ("LOCAL_POSITION_NED", setting(vx=1.5), "estimate at rest", Level.FAIL, "1.50 m/s", "recalibrate"),
+    "no receiver": ("SYS_STATUS", bits(0x10000), "pilot's link", Level.WARN, "no RC receiver", "transmitter"),
+    "armed": ("HEARTBEAT", setting(base_mode=157), "vehicle", Level.FAIL, "armed", "disarm"),
+    "in the air": ("EXTENDED_SYS_STATE", setting(landed_state=2), "vehicle", Level.FAIL, "in the air", "land"),
     "heartbeat silent": ("HEARTBEAT", None, "link", Level.FAIL, "last heartbeat", "check power"),
+    "attitude silent": ("ATTITUDE", None, "link", Level.FAIL, "ATTITUDE", "baud rate"),
+    "position silent": ("LOCAL_POSITION_NED", None, "link", Level.FAIL, "LOCAL_POSITION_NED", "baud rate"),
     "imu silent": ("HIGHRES_IMU", None, "link", Level.FAIL, "HIGHRES_IMU", "baud rate"),
     "old firmware": ("AUTOPILOT_VERSION", setting(flight_sw_version=0x010D0000), "PX4 version", Level.FAIL, "v1.13.0", "update"),
     "new firmware": ("AUTOPILOT_VERSION", setting(flight_sw_version=0x01120000), "PX4 version", Level.WARN, "v1.18.0", "tether"),
@@ -188,7 +201,7 @@ def test_each_fault_of_the_vehicle_in_turn_is_found(air: Air, fault: str) -> Non
         air.telemetry.silent.add(message)
     else:
         air.telemetry.alter[message] = change
-    time.sleep(2.6 if fault == "heartbeat silent" else 0.3)
+    time.sleep(2.6 if message == "HEARTBEAT" else 0.3)  # it comes once a second
     try:
         checks = checkup(air).check_vehicle(air.link, VehicleFacts(air.link), HERE)
     finally:
@@ -249,6 +262,57 @@ def test_each_fault_of_the_lidar_in_turn_is_found(air: Air, fault: str) -> None:
     found = line(checks, name)
     assert found.level is level, checks
     assert seen in found.seen
+    assert advice in found.advice
+
+
+def aged(scan: LidarScan, health: LidarHealth, _: PolicyMetadata) -> list[Check]:
+    return check_lidar(scan, health, scan.time_s + 0.3)
+
+
+def mostly_unknown(scan: LidarScan, health: LidarHealth, _: PolicyMetadata) -> list[Check]:
+    ranges = scan.ranges_m.copy()
+    ranges[: ranges.size * 2 // 3] = np.nan
+    return check_lidar(replace(scan, ranges_m=ranges), health, scan.time_s + 0.05)
+
+
+def narrow(scan: LidarScan, _: LidarHealth, metadata: PolicyMetadata) -> list[Check]:
+    return check_coverage(replace(scan, ranges_m=scan.ranges_m[60:]), metadata)
+
+
+def turned_away(scan: LidarScan, _: LidarHealth, metadata: PolicyMetadata) -> list[Check]:
+    return check_coverage(replace(scan, angle_min_rad=scan.angle_min_rad + math.pi / 2), metadata)
+
+
+def short_sighted(scan: LidarScan, _: LidarHealth, metadata: PolicyMetadata) -> list[Check]:
+    return check_coverage(replace(scan, range_max_m=2.0), metadata)
+
+
+@pytest.mark.parametrize(
+    ("fault", "name", "level", "advice"),
+    [
+        (aged, "lidar", Level.FAIL, "arrive too late"),
+        (mostly_unknown, "lidar", Level.FAIL, "blind sectors"),
+        (narrow, "LiDAR coverage", Level.FAIL, "180 deg wide"),
+        (turned_away, "LiDAR coverage", Level.FAIL, "mount_yaw_deg"),
+        (short_sighted, "LiDAR coverage", Level.WARN, "trained with 4 m"),
+    ],
+)
+def test_age_and_coverage_of_a_scan(
+    air: Air,
+    seeker_policy: Path,
+    fault: Callable[[LidarScan, LidarHealth, PolicyMetadata], list[Check]],
+    name: str,
+    level: Level,
+    advice: str,
+) -> None:
+    """A real scan, made old, blind, narrow, turned or short-sighted."""
+    air.wait(lambda: air.lidar.health().rate_hz > 15.0)
+    scan, health, metadata = air.lidar.latest(), air.lidar.health(), PolicyRunner.load(seeker_policy).metadata
+    assert scan is not None
+    assert line(check_lidar(scan, health, scan.time_s + 0.05), "lidar").level is Level.PASS
+    assert line(check_coverage(scan, metadata), "LiDAR coverage").level is Level.PASS
+    found = line(fault(scan, health, metadata), name)
+    assert found.level is level, found
     assert advice in found.advice
 
 

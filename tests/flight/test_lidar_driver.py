@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from lidar_waits import next_scan, until
 from pydantic import ValidationError
 from scip_peer import BEAMS, Device
 
 from flight.lidar import LidarDriver, LidarSource, open_lidar
 from flight.lidar.clock import MAX_DRIFT, WRAP_MS, DeviceClock, DeviceClockError
-from safety.messages import LidarScan
 
 QUICK = {"reply_timeout_s": 0.3, "stall_timeout_s": 0.3, "reconnect_min_s": 0.02, "reconnect_max_s": 0.1}
 
@@ -25,21 +25,6 @@ def source(device: Device, **changes: object) -> LidarSource:
 def device() -> Iterator[Device]:
     with Device() as running:
         yield running
-
-
-def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> bool:
-    deadline_s = time.monotonic() + timeout_s
-    while time.monotonic() < deadline_s:
-        if condition():
-            return True
-        time.sleep(0.005)
-    return condition()
-
-
-def next_scan(driver: LidarDriver, timeout_s: float = 5.0) -> LidarScan:
-    scan = driver.wait_for_scan(timeout_s)
-    assert scan is not None, driver.health()
-    return scan
 
 
 def test_a_scan_arrives_with_its_geometry_and_codes(device: Device) -> None:

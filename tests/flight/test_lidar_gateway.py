@@ -1,18 +1,26 @@
-"""LiDARs of the running gateway, as a mission finds them: OBSTACLE_DISTANCE over MAVLink, and a flight on an LD06."""
+"""LiDARs of the running gateway, as a mission finds them: OBSTACLE_DISTANCE over MAVLink, flights on an LD06."""
 
 from __future__ import annotations
 
 import math
+import os
+import select
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from stand import Program, Stand
+from air import corridor
+from stand import Program, Stand, free_port
 
 from flight.lidar import BeamReducer, LidarSource, open_lidar
+from flight.lidar.clock import OneWayClock
 from flight.lidar.from_link import feed_from_link
+from flight.lidar.ld06 import LD06_POINTS_PER_S, Ld06Decoder
 from flight.link import VehicleLink
+from sim_gateway.gateway import Gateway, GatewayConfig
+from sim_gateway.pace import Pace
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(400)]
 
@@ -77,3 +85,28 @@ def test_a_flight_on_an_ld06(stand: Stand) -> None:
     assert flight.finish(120.0) == 0, flight.out + flight.err
     summary = stand.summary()
     assert summary["goal_reached"]
+
+
+def test_frames_stay_fresh_on_a_gateway_that_is_too_slow() -> None:
+    """Vehicle time falls ever further behind the clock. Nobody can ask an LD06 for its clock: a lag that grew there once ended
+    flights on a busy computer as `scan_stale`."""
+    config = GatewayConfig(onboard_port=free_port(socket.SOCK_DGRAM), gcs_port=0, lidar_port=0, serial_lidar="ld06")
+    decoder, clock = Ld06Decoder(LD06_POINTS_PER_S), OneWayClock(wrap_s=30.0)
+    ages_s = []
+    with Gateway(corridor(), config) as gateway:
+        gateway.carry = lambda _: ((1.0, 0.0, 1.0), 0.0)
+        gateway.pace = Pace(1.0, 0.0)
+        line = os.open(gateway.ready_message()["serial_lidar"], os.O_RDONLY | os.O_NONBLOCK)
+        try:
+            for now_s in np.arange(0.0, 20.0, 0.006).tolist():  # this computer takes 6 ms for a step of 4 ms
+                if gateway.pace.behind_s(now_s, gateway.vehicle.time_s) >= 0.004:
+                    gateway.step()
+                    points = decoder.feed(os.read(line, 4096) if select.select([line], [], [], 0.0)[0] else b"")
+                    ages_s += [now_s - clock.measured_at(1e-3 * stamp, now_s) for stamp in points.stamp_ms[-1:].tolist()]
+        finally:
+            os.close(line)
+        assert gateway.pace.dropped_s > 6.0, "it was too slow indeed"
+        assert gateway.device_time_s == pytest.approx(20.0, abs=0.2)
+    assert decoder.bad_checksums == 0
+    assert len(ages_s) > 3000
+    assert max(ages_s) < 0.12

@@ -9,11 +9,13 @@ import random
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from spinning_peers import SerialPeer, dense_capsule, express_capsule, ld06_turn, node
+from lidar_waits import next_scan, until
+from spinning_heads import Ld06Head, RplidarHead
+from spinning_peers import SerialPeer
 
 from flight.lidar import BodyMotion, LidarDriver, LidarSource, open_lidar
 from flight.lidar.serial_port import SerialTransport
@@ -33,48 +35,9 @@ def peer() -> Iterator[SerialPeer]:
         yield running
 
 
-def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> bool:
-    deadline_s = time.monotonic() + timeout_s
-    while time.monotonic() < deadline_s:
-        if condition():
-            return True
-        time.sleep(0.005)
-    return condition()
-
-
-def next_scan(driver: LidarDriver, timeout_s: float = 5.0) -> LidarScan:
-    scan = driver.wait_for_scan(timeout_s)
-    assert scan is not None, driver.health()
-    return scan
-
-
 def at(scan: LidarScan, bearing_deg: float) -> float:
     bearings = scan.angle_min_rad + scan.angle_increment_rad * np.arange(scan.ranges_m.size)
     return float(scan.ranges_m[np.argmin(np.abs(bearings - math.radians(bearing_deg)))])
-
-
-def right_is_near(clockwise_deg: float) -> int:
-    """1 m on the right half, 3 m on the left."""
-    return 1000 if 0.0 < clockwise_deg < 180.0 else 3000
-
-
-class Ld06Head:
-    """Frames of a head in real time; faults are attributes."""
-
-    def __init__(self, ranges_mm: Callable[[float], int] = right_is_near) -> None:
-        self.ranges_mm = ranges_mm
-        self.silent = False
-        self.garble: Callable[[bytes], bytes] = lambda data: data
-        self._started_s = time.monotonic()
-        self._sent = 0
-
-    def __call__(self) -> bytes:
-        due = int((time.monotonic() - self._started_s) * 4500 / 12)
-        first, self._sent = self._sent, due
-        if self.silent or due <= first:
-            return b""
-        frames = ld06_turn(self.ranges_mm, first_s=first * 12 / 4500, seconds=(due - first) * 12 / 4500)
-        return self.garble(b"".join(frames))
 
 
 def test_ld06_scans_arrive_with_left_and_right_in_place(peer: SerialPeer) -> None:
@@ -227,84 +190,6 @@ def test_a_pseudo_terminal_has_no_dtr_and_that_is_no_error(peer: SerialPeer) -> 
 
 # -- RPLIDAR --------------------------------------------------------------------------------------------------------
 
-INFO = bytes.fromhex("A55A1400000004")
-MODES = {0: 0x81, 1: 0x82, 2: 0x84, 3: 0x85}  # 84 is a format this driver does not read
-
-
-class RplidarHead:
-    """An RPLIDAR of 8000 points a second for tests."""
-
-    def __init__(self, firmware: tuple[int, int] = (1, 29)) -> None:
-        self.firmware = firmware
-        self.health = 0
-        self.typical = 2
-        self.kind = 0
-        self.commands: list[int] = []
-        self.silent_to: set[int] = set()
-        self.chatter = False
-        self.garble: Callable[[bytes], bytes] = lambda data: data
-        self._sent = 0
-        self._started_s = time.monotonic()
-        self._first = True
-
-    def answer(self, heard: bytes) -> bytes:
-        replies = b""
-        while heard:
-            command = heard[1]
-            size = 3 + heard[2] + 1 if command & 0x80 else 2
-            payload, heard = heard[3 : size - 1], heard[size:]
-            self.commands.append(command)
-            if command not in self.silent_to:
-                replies += self._reply(command, payload)
-        return replies
-
-    def _reply(self, command: int, payload: bytes) -> bytes:
-        if command == 0x25:
-            self.kind = 0
-        if command == 0x50:
-            return INFO + bytes([0x18, self.firmware[1], self.firmware[0], 7]) + bytes(16)
-        if command == 0x52:
-            return bytes.fromhex("A55A0300000006") + bytes([self.health, 0x01, 0x80])
-        if command == 0x59:
-            return bytes.fromhex("A55A0400000015") + (125).to_bytes(2, "little") * 2
-        if command == 0x84:
-            key, mode = payload[0], payload[4]
-            value = {
-                0x70: len(MODES).to_bytes(2, "little"),
-                0x71: (125 * 256).to_bytes(4, "little"),
-                0x74: (16 * 256).to_bytes(4, "little"),
-                0x75: bytes([MODES[mode]]),
-                0x7C: self.typical.to_bytes(2, "little"),
-            }[key]
-            return bytes.fromhex("A55A") + (4 + len(value)).to_bytes(4, "little") + b"\x20" + bytes([key, 0, 0, 0]) + value
-        if command in (0x20, 0x82):
-            self.kind = 0x81 if command == 0x20 else (0x82 if self.firmware < (1, 24) else MODES[payload[0]])
-            self._first = True
-            size = 5 if self.kind == 0x81 else 84
-            return b"\xa5\x5a" + bytes([size, 0, 0, 0x40, self.kind])
-        return b""
-
-    def __call__(self) -> bytes:
-        due = int((time.monotonic() - self._started_s) * 8000)
-        size = {0x81: 1, 0x82: 32, 0x85: 40}.get(self.kind, 1)
-        due -= due % size
-        first, self._sent = self._sent, due
-        if self.chatter:
-            return b"\x55" * 50
-        if not self.kind:
-            return b""
-        return self.garble(b"".join(self._piece(first + k, size) for k in range(0, min(due - first, 800), size)))
-
-    def _piece(self, number: int, size: int) -> bytes:
-        angles = [((number + k) * 10 * 360.0 / 8000) % 360.0 for k in range(size)]
-        ranges = [right_is_near(angle) for angle in angles]
-        opening, self._first = self._first, False
-        if self.kind == 0x81:
-            return node(angles[0], ranges[0], start=angles[0] < 0.5)
-        if self.kind == 0x82:
-            return express_capsule(angles[0], [(mm, 0) for mm in ranges], first=opening)
-        return dense_capsule(angles[0], ranges, first=opening)
-
 
 def stream(peer: SerialPeer, head: RplidarHead) -> None:
     peer.answer = head.answer
@@ -365,6 +250,27 @@ def test_rplidar_mode_it_does_not_have_and_talk_that_does_not_stop(peer: SerialP
         assert until(lambda: "no dense mode" in driver.health().last_error)
         head.chatter = True
         assert until(lambda: "does not stop sending" in driver.health().last_error)
+
+
+@pytest.mark.parametrize(("mode", "sent"), [("express", (0x82, 0x84)), ("dense", (0x85, 0x86)), ("standard", (0x81, 0x83))])
+def test_a_format_that_is_not_read_is_named(peer: SerialPeer, mode: str, sent: tuple[int, int]) -> None:
+    head = RplidarHead()
+    head.sends = dict([sent])
+    stream(peer, head)
+    names = {0x83: "83 (HQ, not read here)", 0x84: "84 (ultra, not read here)", 0x86: "86 (ultra-dense, not read here)"}
+    with open_lidar(source("rplidar", peer, rplidar_mode=mode)) as driver:
+        assert until(lambda: f"asked for scan format {sent[0]:02X} ({mode}), the LiDAR sends {names[sent[1]]}" in
+                     driver.health().last_error), driver.health()  # fmt: skip
+        assert driver.latest() is None
+
+
+def test_a_device_with_none_of_our_formats_is_refused_by_their_names(peer: SerialPeer) -> None:
+    head = RplidarHead()
+    head.modes, head.typical = {0: 0x83, 1: 0x84, 2: 0x86}, 1
+    stream(peer, head)
+    with open_lidar(source("rplidar", peer)) as driver:
+        assert until(lambda: "offers the formats 83 (HQ, not read here), 84 (ultra" in driver.health().last_error)
+        assert "standard, express or dense is needed" in driver.health().last_error
 
 
 def test_rplidar_restart_in_flight_is_recovered(peer: SerialPeer) -> None:

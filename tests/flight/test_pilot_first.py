@@ -360,6 +360,15 @@ def test_a_takeover_while_the_loop_hangs_is_not_followed_by_braking(air: Air, de
     assert flown.ending.in_control is False
 
 
+def test_the_full_garbage_collection_comes_before_offboard(air: Air, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes up to 100 ms, in which no setpoint is sent: PX4 must not be waiting for one."""
+    when: list[str] = []
+    monkeypatch.setattr(gc, "collect", lambda: when.append(air.autopilot.mode.px4_name))
+    engagement(air, as_soon_as_engaged)
+    assert when
+    assert "OFFBOARD" not in when
+
+
 def test_the_link_refuses_everything_after_the_loss(air: Air) -> None:
     """The last gate: whoever still tries gets an error, and the wire stays empty."""
     air.put_back()

@@ -1,4 +1,6 @@
-"""PX4's own log over the real MAVSDK, from a small vehicle that speaks the log messages: whole, none, silent, stalled."""
+"""PX4's own log over the real MAVSDK: from a small vehicle that speaks the log messages (whole, none, silent, stalled), and
+from the gateway after a flight.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from air import open_air
 from pymavlink.dialects.v20 import common as mavlink
+from pyulog import ULog
 from stand import free_port
 
 from flight.link import VehicleLink
@@ -122,3 +126,20 @@ def test_a_signal_ends_a_stalled_download(vehicle: LogVehicle, port: int, tmp_pa
     assert line.startswith("no PX4 log: download failed")
     assert time.monotonic() - begin < 20.0
     assert not (tmp_path / FILE_NAME).exists()
+
+
+@pytest.mark.realtime
+@pytest.mark.timeout(120)
+def test_the_gateways_log_of_a_flight_is_fetched_and_opens(tmp_path: Path, seeker_policy: Path) -> None:
+    with open_air(tmp_path, seeker_policy) as air:
+        air.link.arm()
+        air.link.take_off(1.2)
+        air.wait(lambda: air.gateway.vehicle.simulation.truth.position_m[2] > 1.0, 20.0)
+        air.autopilot.land()
+        air.wait(lambda: not air.autopilot.armed, 30.0)
+        line = fetch_px4_log(air.link.system, tmp_path, Stop())
+    assert line.startswith(f"PX4 log: {tmp_path / FILE_NAME} ("), line
+    log = ULog(str(tmp_path / FILE_NAME))
+    assert not log.file_corruption
+    assert log.get_dataset("vehicle_local_position").data["z"].min() < -1.0
+    assert {17, 18} <= set(log.get_dataset("vehicle_status").data["nav_state"])

@@ -164,6 +164,10 @@ def test_sigkill_in_flight_keeps_all_but_the_last_second(tmp_path: Path, seeker_
     result = compare(read_recording(Path(report["output"])))
     assert result.identical, result.first
     assert result.ticks == len(ticks)
+    reported = Program("flight", "report", str(tmp_path / "run"))
+    assert reported.finish(120.0) == 0, reported.err
+    assert "broken off" in (tmp_path / "run" / "report.html").read_text()
+    assert (tmp_path / "run" / "trajectory.png").is_file()
 
 
 def test_replay_takes_a_cut_file_as_it_is(tmp_path: Path, whole: bytes) -> None:

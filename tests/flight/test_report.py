@@ -9,7 +9,6 @@ import re
 import shutil
 import struct
 import subprocess
-import sys
 import zlib
 from html.parser import HTMLParser
 from pathlib import Path
@@ -18,6 +17,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 from flight_records import GOAL, flown, limited, record
+from stand import Program
 
 from flight.flight_log import FlightLog
 from flight.rate_keeper import LatenessStatistics, RateStatistics
@@ -251,12 +251,10 @@ def test_a_folder_without_a_flight_is_refused_in_one_line(tmp_path: Path) -> Non
     (tmp_path / "trajectory.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ReportError, match=r"trajectory\.csv"):
         write_report(tmp_path)
-    done = subprocess.run(
-        [sys.executable, "-m", "flight.report", str(tmp_path)], cwd=ROOT, check=False, capture_output=True, text=True, timeout=60
-    )
-    assert done.returncode == 2
-    assert done.stderr.startswith("report: ")
-    assert done.stderr.count("\n") == 1
+    done = Program("flight", "report", str(tmp_path))
+    assert done.finish(60.0) == 2
+    assert done.err.startswith("fly: ")
+    assert done.err.count("\n") == 1
 
 
 def test_a_table_of_events_stays_readable(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ from spinning_peers import dense_capsule, express_capsule, node
 
 from flight.lidar import rplidar
 from flight.lidar.points import PointDecoder, Points, join_points
-from flight.lidar.rplidar import AnswerReader, CapsuleDecoder, RplidarError, StandardDecoder
+from flight.lidar.rplidar import AnswerReader, RplidarError
+from flight.lidar.rplidar_decoders import CapsuleDecoder, StandardDecoder
 
 MUTATED_BYTES = 1_000_000
 SAMPLE_S = 1.0 / 8000.0
@@ -42,7 +43,14 @@ def test_requests_on_the_wire() -> None:
 
 @pytest.mark.parametrize(
     ("descriptor", "kind"),
-    [("A55A0500004081", 0x81), ("A55A5400004082", 0x82), ("A55A5400004085", 0x85)],
+    [
+        ("A55A0500004081", 0x81),
+        ("A55A5400004082", 0x82),
+        ("A55A5400004085", 0x85),
+        ("A55A0D03004083", 0x83),
+        ("A55A8400004084", 0x84),
+        ("A55AAA00004086", 0x86),
+    ],
 )
 def test_descriptors_of_streams(descriptor: str, kind: int) -> None:
     reader = AnswerReader()

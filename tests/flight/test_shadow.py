@@ -107,7 +107,7 @@ def test_the_vehicle_receives_nothing_from_a_shadow(shadowed: tuple[FlightResult
     result, _, air = shadowed
     assert air.received() == []
     assert result.summary["setpoints_sent"] == 0
-    kinds = {name for name, system, _ in air.gateway.server.counts if system == 245}
+    kinds = {name for name, system, _ in air.gateway.server.wire_log.counts if system == 245}
     assert not any(name.startswith("SET_") for name in kinds), kinds
     assert "PARAM_SET" not in kinds
     assert {"HEARTBEAT", "COMMAND_LONG"} <= kinds  # it was connected, and asked for stream rates

@@ -21,7 +21,6 @@ brakings = st.floats(0.5, 6.0)
     ("changes", "words"),
     [
         ({"lag_min_s": 0.9}, "lag_min_s"),
-        ({"blind_speed_m_s": 2.0}, "blind_speed_m_s"),
         ({"return_speed_m_s": 2.0}, "return_speed_m_s"),
         ({"memory_hold_s": 30.0}, "memory_hold_s"),
         ({"hold_off_speed_m_s": 0.4}, "hold_off_speed_m_s"),
@@ -66,7 +65,6 @@ def test_defaults_are_the_reviewed_numbers():
         "scan_stale_s": 0.25,
         "state_stale_s": 0.2,
         "future_tolerance_s": 0.02,
-        "blind_speed_m_s": 0.3,
         "return_speed_m_s": 0.3,
         "hold_off_speed_m_s": 0.25,
         "fov_margin_rad": 0.1,

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safety_plant import config, scan, state
 
-from safety.lidar import BeamTable, blind, clean_ranges, scan_problem, see
+from safety.lidar import BeamTable, clean_ranges, scan_problem, see
 from safety.memory import CAPACITY, ObstacleMemory
 from safety.messages import LidarScan
 
@@ -113,34 +113,6 @@ def test_tilted_beam_that_meets_the_ground_is_unknown(roll, pitch, beam, low):
 def test_tilt_shortens_the_horizontal_distance():
     found = seen(one_return(90, 2.0), state(z=3.0, pitch=-0.3))
     assert found.x_m[0] - 5.0 == pytest.approx(2.0 * math.cos(0.3), abs=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("direction_deg", "unseen"), [(0, False), (80, False), (-80, False), (88, True), (-88, True), (180, True), (135, True)]
-)
-def test_directions_outside_the_view_are_blind(direction_deg, unseen):
-    assert bool(blind(seen(), np.array([math.radians(direction_deg)]), 0.0, C)[0]) == unseen
-
-
-def test_view_turns_with_the_vehicle_and_wraps():
-    for turns in (-2, 0, 3):
-        yaw = math.pi + 2 * math.pi * turns
-        assert not blind(seen(pose=state(yaw=yaw)), np.array([math.pi]), yaw, C)[0]
-        assert blind(seen(pose=state(yaw=yaw)), np.array([0.0]), yaw, C)[0]
-
-
-def test_all_round_scan_has_no_blind_side():
-    found = seen(beams=360, fov=2 * math.pi)
-    assert not blind(found, np.linspace(-math.pi, math.pi, 50), 0.3, C).any()
-
-
-def test_unknown_sector_is_blind_but_one_lost_beam_is_not():
-    ranges = np.full(180, np.inf)
-    ranges[90] = np.nan
-    assert not blind(seen(ranges), np.array([0.0]), 0.0, C)[0]
-    ranges[80:100] = np.nan
-    assert blind(seen(ranges), np.array([0.0]), 0.0, C)[0]
-    assert not blind(seen(ranges), np.array([1.0]), 0.0, C)[0]
 
 
 def fed(memory, ranges, time_s, pose=None):

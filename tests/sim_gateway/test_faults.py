@@ -348,7 +348,7 @@ def test_another_program_moves_the_vehicle() -> None:
     rig.fly = None
     rig.run(3.0)
     assert rig.vehicle.simulation.truth.velocity_m_s[0] == pytest.approx(0.5, abs=0.1)
-    assert {item.sender for item in rig.server.wire_log} == {(200, 191)}
+    assert {item.sender for item in rig.server.wire_log.entries} == {(200, 191)}
 
 
 # -- MAV_CMD_INJECT_FAILURE
