@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from safety_plant import config
 
-from safety.allowance import Allowance, allowance, held_in
+from safety.allowance import Allowance, _fence_due_m_s, _outward, _strongest_per_sector, _way_out_m_s, allowance, held_in
 from safety.braking import Tubes, stop_gain_s
 from safety.fence_tube import WaysOut
 
@@ -56,24 +56,30 @@ def fence_hold_off(depth):
 @pytest.mark.parametrize("seed", range(120))
 def test_directions_and_speeds_due_are_those_of_the_slow_way(seed):
     position, tube, points, clear, fence, _ = scene(seed)
-    found = allowance(tube, clear, fence, points, position, None, C)
+    normals, speeds = _outward(tube, clear, points, position, C)
+    depths = [max(-c - SLIDE, KEEP_OUT - SLIDE - math.dist(p, position)) for p, c in zip(points.T, clear, strict=True)]
     wanted = []
-    for p, c in zip(points.T, clear, strict=True):
-        here = KEEP_OUT - SLIDE - math.dist(p, position)
-        depth = max(-c - SLIDE, here)
-        if depth <= 0.0:
+    for p, c, depth in zip(points.T, clear, depths, strict=True):
+        if max(depths) <= 0.0 or depth <= -0.05:
             continue
-        near_now = here >= -c - SLIDE
+        near_now = KEEP_OUT - SLIDE - math.dist(p, position) >= -c - SLIDE
         place = position if near_now or depth > MARGIN else to_leg(p, tube.turn_m[0, -1, :2], tube.stop_m[0, -1, :2])[0]
         away = (place - p) / max(math.dist(place, p), 1e-6)
-        wanted.append((*away, hold_off(depth) if depth <= MARGIN + POINT_BAND else 0.0))
-    assert found.outward_m_s.shape == (len(wanted),)
+        due = hold_off(depth) if depth <= MARGIN + POINT_BAND else 0.0
+        wanted.append((*away, due if depth > 0.0 else depth / GAIN))
+    assert speeds.shape == (len(wanted),)
     for at, (x, y, speed) in enumerate(wanted):
-        assert (found.normals[0, at], found.normals[1, at], found.outward_m_s[at]) == pytest.approx((x, y, speed), abs=1e-9)
+        assert (normals[0, at], normals[1, at], speeds[at]) == pytest.approx((x, y, speed), abs=1e-9)
+    found = allowance(tube, clear, fence, points, position, None, C)
     worst = min([0.0, *clear])
     assert found.clearance_m == pytest.approx(np.array([min(c, max(worst, -SLIDE)) for c in clear]))
     assert found.fence_m == pytest.approx(np.minimum(fence, 0.0))
     assert (found.brake_stop_m == tube.stop_m[:, -1]).all()
+    push = _way_out_m_s(normals, speeds, C)
+    assert found.push_m_s == pytest.approx(push)
+    asked = [(n, d) for n, d in zip(normals.T, speeds, strict=True) if d >= 0.0]
+    assert found.normals == pytest.approx(np.array([n for n, _ in asked]).reshape(-1, 2).T)
+    assert found.outward_m_s == pytest.approx(np.array([min(d, push @ n) if d > 0.0 else d for n, d in asked]))
 
 
 @pytest.mark.parametrize("room", [-0.9, -0.52, -0.5201, -0.5199, -0.3, -0.045, -0.03, -0.02, -0.0201, -0.01, 0.0, 0.004, 0.3])
@@ -96,32 +102,43 @@ def ways(chance, count):
     return WaysOut(normals, np.array([chance.choice((-0.7, -0.52, -0.3, -0.03, -0.02, -0.01, 0.0, 0.01, 0.2)) for _ in bearings]))
 
 
+def fence_due(room):
+    depth = -room - SLIDE
+    return fence_hold_off(depth) if depth > 0.0 else -max(room, 0.0) / GAIN
+
+
 @pytest.mark.parametrize("seed", range(60))
 def test_ways_out_of_the_fence_are_added(seed):
     position, tube, points, clear, fence, chance = scene(seed)
-    plain = allowance(tube, clear, fence, points, position, None, C)
     out = ways(chance, 4)
+    assert _fence_due_m_s(out, C) == pytest.approx([fence_due(room) for room in out.room_m])
+    normals, speeds = _outward(tube, clear, points, position, C)
+    normals = np.concatenate((normals, out.normals), axis=1)
+    speeds = np.concatenate((speeds, [fence_due(room) for room in out.room_m]))
     found = allowance(tube, clear, fence, points, position, out, C)
-    due = [(n, fence_hold_off(-r - SLIDE)) for n, r in zip(out.normals.T, out.room_m, strict=True) if -r - SLIDE > 0.0]
-    assert found.normals == pytest.approx(np.concatenate((plain.normals, np.array([n for n, _ in due]).reshape(-1, 2).T), axis=1))
-    assert found.outward_m_s == pytest.approx(np.array([*plain.outward_m_s, *(speed for _, speed in due)]))
+    push = _way_out_m_s(normals, speeds, C)
+    assert found.push_m_s == pytest.approx(push)
+    assert found.normals == pytest.approx(normals[:, speeds >= 0.0])
+    held = [min(d, push @ n) if d > 0.0 else d for n, d in zip(normals.T, speeds, strict=True) if d >= 0.0]
+    assert found.outward_m_s == pytest.approx(np.array(held))
 
 
 @pytest.mark.parametrize("seed", range(60))
 def test_held_in_takes_off_what_breaks_the_worst_bound_three_times(seed):
     chance = random.Random(seed)
     out = ways(chance, chance.choice((0, 1, 3)))
+    push = np.array((chance.uniform(-0.3, 0.3), chance.uniform(-0.3, 0.3)))
     candidates = np.array([[chance.uniform(-1, 1) for _ in range(3)] for _ in range(4)])
     before = candidates.copy()
-    found = held_in(candidates, out, C)
+    found = held_in(candidates, out, push, C)
     assert (candidates == before).all()
     for row, wanted in zip(found, before, strict=True):
         velocity = list(wanted)
         for _ in range(3 if out.room_m.shape[0] else 0):
             lacking = []
             for (nx, ny), room in zip(out.normals.T, out.room_m, strict=True):
-                depth = -room - SLIDE
-                due = fence_hold_off(depth) if depth > 0.0 else -max(room, 0.0) / GAIN
+                due = fence_due(room)
+                due = min(due, push[0] * nx + push[1] * ny) if due > 0.0 else due
                 lacking.append((due - velocity[0] * nx - velocity[1] * ny, nx, ny))
             worst, nx, ny = max(lacking)
             velocity[0] += max(worst, 0.0) * nx
@@ -129,10 +146,49 @@ def test_held_in_takes_off_what_breaks_the_worst_bound_three_times(seed):
         assert row == pytest.approx(velocity, abs=1e-9)
 
 
+def test_of_each_sixteenth_of_a_turn_the_strongest_demand_counts():
+    bearings = [(k + 0.5) * math.pi / 8 for k in range(16)]
+    normals = np.array([(math.cos(b), math.sin(b)) for b in bearings for _ in range(3)]).T
+    due = np.array([value for k in range(16) for value in (0.1, 0.3 + 0.01 * k, -0.2)])
+    assert sorted(_strongest_per_sector(normals, due).tolist()) == [3 * k + 1 for k in range(16)]
+    assert _strongest_per_sector(np.empty((2, 0)), np.empty(0)).shape == (0,)
+
+
+def demand(*pairs):
+    return np.array([n for n, _ in pairs]).T, np.array([d for _, d in pairs])
+
+
+EAST, NORTH, WEST = (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("demands", "way"),
+    [
+        ([(EAST, 0.2)], (0.2, 0.0)),
+        ([(EAST, 0.2), (NORTH, 0.1)], (0.2, 0.1)),
+        ([(EAST, 0.2), (WEST, 0.2)], (0.0, 0.0)),  # contradiction: half way
+        ([(EAST, 0.2), (WEST, 0.1)], (0.05, 0.0)),
+        ([(EAST, 0.2), (WEST, -0.15)], (0.15, 0.0)),  # a bound weighs more than a demand
+        ([(EAST, 0.2), (WEST, 0.0)], (0.0, 0.0)),
+        ([(EAST, 0.25), (NORTH, 0.25)], (0.3 / math.sqrt(2), 0.3 / math.sqrt(2))),  # no longer than the return speed
+        ([(EAST, -0.1)], (0.0, 0.0)),
+        ([(EAST, 0.0)], (0.0, 0.0)),
+    ],
+)
+def test_the_way_out_does_all_that_is_due_or_half_of_what_contradicts(demands, way):
+    assert _way_out_m_s(*demand(*demands), C) == pytest.approx(way, abs=1e-4)
+
+
 def plain(**parts):
     """An allowance that permits everything but what `parts` forbid."""
     free = {"clearance_m": np.array([0.0]), "fence_m": np.array([0.0, 0.0, 0.0]), "normals": np.empty((2, 0))}
-    free |= {"outward_m_s": np.empty(0), "sink_m_s": -1.0, "climb_m_s": 1.0, "brake_stop_m": np.zeros((2, 3))}
+    free |= {
+        "outward_m_s": np.empty(0),
+        "push_m_s": np.zeros(2),
+        "sink_m_s": -1.0,
+        "climb_m_s": 1.0,
+        "brake_stop_m": np.zeros((2, 3)),
+    }
     return Allowance(**(free | parts))
 
 
@@ -177,11 +233,6 @@ def test_candidates_are_judged_one_by_one_at_their_worst_place():
     assert (plain().shortfall_m_s(candidates) == -math.inf).all()
 
 
-def test_push_leads_out_with_the_greatest_speed_that_is_due():
-    assert plain().push_m_s.tolist() == [0.0, 0.0]
-    both = plain(normals=np.array([[1.0, 0.0], [0.0, 1.0]]), outward_m_s=np.array([0.3, 0.4]))
-    assert both.push_m_s == pytest.approx((0.24, 0.32))
-    against = plain(normals=np.array([[1.0, -1.0], [0.0, 0.0]]), outward_m_s=np.array([0.2, 0.2]))
-    assert against.push_m_s.tolist() == [0.0, 0.0]
-    nearly = plain(normals=np.array([[1.0, -1.0], [0.0, 0.0]]), outward_m_s=np.array([0.2, 0.2 + 1e-8]))
-    assert nearly.push_m_s[0] == pytest.approx(-1e-8 * 0.2 / 1e-6, rel=1e-3)
+@pytest.mark.parametrize(("sink", "climb", "hover"), [(-1.0, 1.0, 0.0), (0.2, 1.0, 0.2), (-1.0, -0.1, -0.1), (0.0, 0.0, 0.0)])
+def test_hovering_leads_back_from_floor_and_ceiling(sink, climb, hover):
+    assert plain(sink_m_s=sink, climb_m_s=climb).hover_m_s.tolist() == [0.0, 0.0, hover]

@@ -33,7 +33,7 @@ def test_flights_meet_every_stage():
         "fence",
         "hold_off",
         "return_speed",
-        "blind_speed",
+        "unseen",
         "speed_limit",
         "acceleration_limit",
         "speed_cap",
