@@ -75,7 +75,8 @@ class Sight:
         passed = brake.permits(hidden)
         if brake.exact[0] == 0 or not passed.any():
             return passed
-        return passed & ((hidden.exact == 0) | self._leads_out(tube, brake_stop_m[0, :2], view))
+        leading: Booleans = passed & ((hidden.exact == 0) | self._leads_out(tube, brake_stop_m[0, :2], view))
+        return leading
 
     @staticmethod
     def _leads_out(tube: Tubes, stop_m: Floats, view: View) -> Booleans:

@@ -82,6 +82,8 @@ def run_all(wanted: list[Case], mission_file: Path, jobs: int | None = None) -> 
             results[case] = result
             bad = sum(r.problem is not None for r in results.values())
             progress.update(bar, advance=1, bad=bad)
+            if result.problem is not None:
+                progress.console.print(f"{result.fault} {result.scene} seed {result.seed}: {result.problem}", highlight=False)
     return [results[case] for case in wanted]
 
 

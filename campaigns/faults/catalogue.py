@@ -122,15 +122,18 @@ def _in(expected: Expected, *scenes: str) -> dict[str, Expected]:
 
 
 _SLOW = "seen only in motion of 0.3 m/s or more"
+_FROM_THE_START = "before OFFBOARD nothing tells a blind scanner from open space: residual risk"
 _LIDAR = (
     Entry("L1", "no scan", _brake(0.3, "scan_stale", "scan_missing"), _lasting("lidar_silent")),
     Entry("L2", "frozen scan, fresh stamps", _brake(0.4, "scan_frozen"), _lasting("lidar_freeze"),
-          scenes=_in(SAFE, "hover"), note=_SLOW),
+          scenes=_in(SAFE, "hover", "engage", "braking"), note=_SLOW),
     Entry("L3", "frozen scan, old stamps", _brake(0.3, "scan_stale"), _lasting("lidar_freeze_old")),
-    Entry("L4", "nothing seen in any beam", _brake(0.25, "scan_blank"), _lasting("lidar_max")),
+    Entry("L4", "nothing seen in any beam", _brake(0.25, "scan_blank"), _lasting("lidar_max"),
+          scenes=_in(SAFE, "engage"), note=_FROM_THE_START),
     Entry("L5", "every beam too near", _brake(TICK_S, "scan_touching"), _lasting("lidar_min")),
     Entry("L6", "NaN in all beams", _brake(TICK_S, "scan_unknown"), _lasting("lidar_nan")),
-    Entry("L7", "overflow, 65535 in all beams", _brake(TICK_S, "scan_blank", "scan_unknown"), _lasting("lidar_value")),
+    Entry("L7", "overflow, 65535 in all beams", _brake(TICK_S, "scan_blank", "scan_unknown"), _lasting("lidar_value"),
+          scenes=_in(SAFE, "engage"), note=_FROM_THE_START),
     Entry("L8", "wrong beam count", _brake(0.3, "scan_stale", "scan_missing", "scan_source"), _lasting("lidar_beams")),
     Entry("L9", "mirrored scan", SAFE, _lasting("lidar_mirror"), scenes=_in(_hold(1.5, "scan_mirrored"), "yawing"),
           note="seen only while the vehicle turns"),
@@ -150,7 +153,7 @@ _LIDAR = (
 )  # fmt: skip
 _ESTIMATE = (
     Entry("E1", "position jumps by 1 m and back", _brake(TICK_S, "estimate_jump", "estimate_jump_again"),
-          _lasting("estimate_jump", 0.6)),
+          _lasting("estimate_jump", 0.6), scenes=_in(SAFE, "engage"), note="over before the loop begins, in scene engage"),
     Entry("E2", "frozen odometry, fresh stamps", _brake(0.35, "estimate_frozen"), _lasting("report_freeze"),
           scenes=_in(SAFE, "hover", "braking"), note="seen only while 0.3 m/s or more is commanded"),
     Entry("E3", "stale odometry", _brake(0.25, "state_stale"), _lasting("report_stale")),

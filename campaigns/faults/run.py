@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from campaigns.faults.catalogue import Entry
+from campaigns.faults.catalogue import LASTS_S, Entry
 from campaigns.faults.oracle import Verdict, judge
 from campaigns.faults.scenes import SCENES
 from campaigns.faults.stage import Stage, Trace, felt_s
@@ -13,7 +14,7 @@ from flight.mission import Mission
 from policy_export.runner import PolicyRunner
 from safety.filter import SafetyFilter
 
-OBSERVED_S = 4.5
+OBSERVED_S = 3.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,4 +41,7 @@ def play(
         entry.inject(stage)
     trace = stage.play()
     trace.felt_s = felt_s(stage, entry.felt_with) + entry.felt_after_s
+    if SCENES[scene].before_offboard and trace.records:
+        trace.felt_s = max(trace.felt_s, trace.records[0][0])
+    trace.over_s = trace.begin_s + max((fault.duration_s or math.inf for fault in entry.faults), default=LASTS_S)
     return trace, judge(trace, entry.expects(scene))
