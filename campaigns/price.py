@@ -50,9 +50,8 @@ def price(on: dict[str, Any], off: dict[str, Any]) -> dict[str, Any]:
 
 def acceptable(found: dict[str, Any]) -> bool:
     """Whether both differences are inside their bounds."""
-    return (
-        found["clean_success_difference"] >= -MOST_SUCCESS_LOST - ROUNDING and found["mean_speed_ratio"] >= 1.0 - MOST_SPEED_LOST
-    )
+    lost, ratio = -float(found["clean_success_difference"]), float(found["mean_speed_ratio"])
+    return lost <= MOST_SUCCESS_LOST + ROUNDING and ratio >= 1.0 - MOST_SPEED_LOST
 
 
 def markdown(report: dict[str, Any]) -> str:
@@ -91,16 +90,17 @@ def main() -> int:
         )
         for name, filtered in (("on", True), ("off", False))
     }
+    found = price(sides["on"], sides["off"])
     report = {
         "command": f"python -m campaigns.price --split {chosen.split} --episodes {chosen.episodes} --out {chosen.out}",
         "policy": str(chosen.policy),
-        "price": price(sides["on"], sides["off"]),
+        "price": found,
         **sides,
     }
     chosen.out.parent.mkdir(parents=True, exist_ok=True)
     chosen.out.write_text(json.dumps(report, indent=1) + "\n")
     print(markdown(report))
-    return 0 if acceptable(report["price"]) else 1
+    return 0 if acceptable(found) else 1
 
 
 if __name__ == "__main__":

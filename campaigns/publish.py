@@ -12,15 +12,20 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from campaigns.faults.report import markdown as fault_table
 from campaigns.process_death import markdown
 from policy_export.errors import PolicyError
 from policy_export.policy_file import PolicyFile, read_policy_file
+from sim_gateway.faults import KINDS, Kind
 
 RESULTS = Path("results")
 POLICIES = Path("policies")
 README = Path("README.md")
 SAFETY = Path("docs/safety.md")
 BEGIN, END = "<!-- results -->", "<!-- end of results -->"
+GATEWAY = Path("docs/gateway.md")
+FAULTS = "<!-- fault campaign -->", "<!-- end of fault campaign -->"
+FAULT_KINDS = "<!-- fault kinds -->", "<!-- end of fault kinds -->"
 PROCESS_DEATH = "<!-- process death -->", "<!-- end of process death -->"
 PAPER_UNSEEN_SUCCESS = "77.4 %"
 PAPER_PATH_EFFICIENCY = "0.85"
@@ -126,6 +131,29 @@ def publish() -> None:
     _write_block(README, BEGIN, END, f"{table(lockstep_rows(results) + realtime_rows(results))}\n\n{note}")
     if "process_death" in results:
         _write_block(SAFETY, *PROCESS_DEATH, process_death(results["process_death"]))
+    flown = [results[name] for name in ("faults", "faults_realtime") if name in results]
+    if flown:
+        _write_block(SAFETY, *FAULTS, "\n\n".join(fault_campaign(result) for result in flown))
+    _write_block(GATEWAY, *FAULT_KINDS, fault_kinds())
+
+
+def fault_campaign(result: dict[str, Any]) -> str:
+    """The reactions of one campaign, and what was wrong."""
+    wrong = "".join(f"\n- {item['fault']} {item['scene']}, seed {item['seed']}: {item['problem']}" for item in result["wrong"])
+    counts = f"{result['faults']} faults, {result['runs']} runs, {result['right']} with the right reaction in time"
+    total = f"`{result['command']}`: {counts}."
+    slack = f" Bounds are those of the table above and {1e3 * result['slack_s']:.0f} ms." if "slack_s" in result else ""
+    return f"{total}{slack}{wrong}\n\n{fault_table(result)}"
+
+
+def fault_kinds() -> str:
+    """The kinds of fault that the gateway makes."""
+    rows = [f"| {kind.group} | `{name}` | {kind.does} | {_parameters(kind)} |" for name, kind in KINDS.items()]
+    return "\n".join(["| group | kind | what happens | parameters, defaults |", "|---|---|---|---|", *rows])
+
+
+def _parameters(kind: Kind) -> str:
+    return ", ".join(f"{name} {value:g}" for name, value in kind.defaults.items()) or ("at once" if kind.once else "")
 
 
 def process_death(result: dict[str, Any]) -> str:

@@ -218,8 +218,9 @@ class VehicleLink:
         """Ask for the messages the loop lives on at `rate_hz`. Raises `VehicleCommandError` when PX4 refuses."""
         for name in ("LOCAL_POSITION_NED", "ATTITUDE", "HIGHRES_IMU"):
             self.request_message_rate(name, rate_hz)
-        for name in ("ODOMETRY", "ESTIMATOR_STATUS", "POSITION_TARGET_LOCAL_NED"):
+        for name in ("ODOMETRY", "ESTIMATOR_STATUS"):
             self.request_message_rate(name, REPORT_RATE_HZ)
+        self.request_message_rate("POSITION_TARGET_LOCAL_NED", rate_hz)  # often enough to catch a setpoint between two of ours
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float, keep_alive: Callable[[], None] | None = None) -> bool:
         """Poll `condition` every 10 ms until it holds (True) or `timeout_s` passed (False). Raises `GuardLostError`."""

@@ -154,7 +154,7 @@ def _way_out_m_s(normals: Floats, due_m_s: Floats, config: SafetyConfig) -> Floa
         if not unmet.any():
             break
         active, weighted = held[:, unmet], held[:, unmet] * weight[unmet]
-        way = np.linalg.solve(weighted @ active.T + EPSILON_M * np.eye(2), weighted @ due[unmet])
+        way[:] = np.linalg.solve(weighted @ active.T + EPSILON_M * np.eye(2), weighted @ due[unmet])
     return way * min(1.0, (config.return_speed_m_s - EPSILON_M) / max(float(np.hypot(way[0], way[1])), _LEAST_M))
 
 

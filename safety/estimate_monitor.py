@@ -29,6 +29,7 @@ class EstimateMonitor:
         """Forget earlier samples."""
         self._last: VehicleState | None = None
         self._moved_s = -math.inf
+        self._stuck = False
         self._jump_s = -math.inf
         self._inaccurate_s: float | None = None
         self._drift.clear()
@@ -111,11 +112,16 @@ class EstimateMonitor:
             found.append(Intervention("velocity_mismatch", max(across, up), config.velocity_mismatch_m_s))
 
     def _judge_frozen(self, last: VehicleState, state: VehicleState, commanded_m_s: float, found: list[Intervention]) -> None:
-        """E2: the same position and velocity in every bit, under fresh stamps, while motion is commanded."""
-        if commanded_m_s < self._config.frozen_command_m_s or state.position != last.position or state.velocity != last.velocity:
-            self._moved_s = state.time_s
+        """E2: the same position and velocity in every bit, under fresh stamps, while motion is commanded.
+
+        Once seen it lasts until a bit changes, although nothing is commanded any more.
+        """
+        moved = state.position != last.position or state.velocity != last.velocity
+        if moved or (commanded_m_s < self._config.frozen_command_m_s and not self._stuck):
+            self._moved_s, self._stuck = state.time_s, False
             return
         self._moved_s = max(self._moved_s, last.time_s) if math.isinf(self._moved_s) else self._moved_s
         still_s = state.time_s - self._moved_s
         if still_s > self._config.frozen_state_s + ROUNDING_S:
+            self._stuck = True
             found.append(Intervention("estimate_frozen", still_s, self._config.frozen_state_s))

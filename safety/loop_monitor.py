@@ -11,6 +11,9 @@ from safety.messages import Health, Intervention
 from safety.monitor_config import MonitorConfig
 
 MISSES_WITHIN_S = 1.0
+FOREIGN_WITHIN_S = 1.0
+FOREIGN_ECHOES = 6  # of them within that time: another sender's setpoints may stand between ours
+MAX_FOREIGN = 128
 ROUNDING_S = 1e-6
 ZERO = CorridorVector(0.0, 0.0, 0.0)
 
@@ -21,6 +24,7 @@ class LoopMonitor:
     def __init__(self, config: MonitorConfig) -> None:
         self._config = config
         self._misses: deque[float] = deque(maxlen=config.late_ticks)
+        self._foreign: deque[float] = deque(maxlen=MAX_FOREIGN)
         self.reset()
 
     def reset(self) -> None:
@@ -28,7 +32,7 @@ class LoopMonitor:
         self._last_s: float | None = None
         self._boots: int | None = None
         self._slow_since_s: float | None = None
-        self._foreign_since_s: float | None = None
+        self._foreign.clear()
         self._echo_s = -math.inf
         self._misses.clear()
 
@@ -74,17 +78,17 @@ class LoopMonitor:
             found.append(Intervention("link_slow", health.link_delay_s, config.link_delay_s))
 
     def _judge_echo(self, health: Health, history: CommandHistory, found: list[Intervention]) -> None:
-        """K6: the autopilot follows a setpoint that we did not send. Zero velocity accuses nobody."""
+        """K6: the autopilot follows setpoints that we did not send, between ours or alone. Zero velocity accuses nobody."""
         config, echo, time_s = self._config, health.echo, health.echo_time_s
         if echo is None or not time_s > self._echo_s:
             return
         self._echo_s = time_s
         error = min(_distance(echo, velocity) for velocity in (ZERO, *history.sent(time_s - config.echo_s, time_s)))
         if not error > config.echo_error_m_s:
-            self._foreign_since_s = None
             return
-        self._foreign_since_s = time_s if self._foreign_since_s is None else self._foreign_since_s
-        if time_s - self._foreign_since_s >= config.echo_s - ROUNDING_S:
+        self._foreign.append(time_s)
+        recent = [then_s for then_s in self._foreign if time_s - then_s <= FOREIGN_WITHIN_S]
+        if len(recent) >= FOREIGN_ECHOES and time_s - recent[0] >= config.echo_s - ROUNDING_S:
             found.append(Intervention("foreign_setpoint", error, config.echo_error_m_s))
 
     def _judge_battery(self, health: Health, found: list[Intervention]) -> None:

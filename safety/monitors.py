@@ -105,6 +105,7 @@ class InputMonitor:
         self._scan_time_s = -math.inf
         self._ranges: NDArray[np.floating] | None = None
         self._frozen = 0
+        self._stuck = False
         self._walled = False
 
     def judge(
@@ -221,7 +222,10 @@ class InputMonitor:
         return bool((np.isfinite(scan.ranges_m) & (scan.ranges_m > self._config.vehicle_radius_m)).any())
 
     def _frozen_fault(self, scan: LidarScan, state: VehicleState | None) -> Intervention | None:
-        """Bit-identical scans with new stamps while the vehicle moves (L2). Empty scans are alike by right."""
+        """Bit-identical scans with new stamps while the vehicle moves (L2). Empty scans are alike by right.
+
+        Once seen in motion it lasts until a scan differs: a vehicle that has braked must not fly on by a frozen picture.
+        """
         if scan.time_s > self._scan_time_s:
             same = self._ranges is not None and np.array_equal(scan.ranges_m, self._ranges) and self._shows_something(scan)
             self._frozen = self._frozen + 1 if same else 0
@@ -231,7 +235,8 @@ class InputMonitor:
             return None
         speed = math.hypot(state.velocity.x, state.velocity.y)
         moving = speed > FROZEN_SPEED_M_S or abs(state.yaw_rate_rad_s) > FROZEN_YAW_RATE_RAD_S
-        if self._frozen >= FROZEN_SCANS and moving:
+        self._stuck = self._frozen >= FROZEN_SCANS and (moving or self._stuck)
+        if self._stuck:
             return Intervention("scan_frozen", float(self._frozen), float(FROZEN_SCANS))
         return None
 

@@ -162,7 +162,7 @@ class UdpLink(MavlinkLink):
         try:
             data = message.data if isinstance(message, Garbage) else message.pack(self._packer)
         except (struct.error, OverflowError, ValueError) as error:
-            _log.error("%s has a value outside its field: %s", message, error)
+            _log.error("message %s has a value outside its field: %s", type(message).__name__, error)
             return
         for peer in (self._client, *self._peers):
             try:

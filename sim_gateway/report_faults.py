@@ -6,11 +6,13 @@ import math
 from dataclasses import replace
 
 from sim_gateway.faults import REPORT, Active, FaultSchedule
+from sim_gateway.local_frame import Vector
 from sim_gateway.motion_faults import MotionFaults
 from sim_gateway.telemetry import Message, Snapshot
 
 _PLACE = ("LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT")
 _MOTION = (*_PLACE, "ATTITUDE", "ATTITUDE_QUATERNION", "HIGHRES_IMU")
+_CLOCKS = {"report_backwards": -1.0, "report_clock": 1.0}
 _ON_GROUND = 1
 _VELOCITY_FLAGS = 2 | 4  # of ESTIMATOR_STATUS
 _ACCURACY_M = 0.3
@@ -39,21 +41,17 @@ class ReportFaults:
 
     def _told(self, item: Active, name: str, now: Snapshot) -> Snapshot:
         kept = self._kept.setdefault(item.number, now)
-        if item.kind == "report_freeze" and name in _PLACE:
+        if item.kind in _CLOCKS:
+            return replace(now, time_s=now.time_s + _CLOCKS[item.kind] * item["step_s"])
+        if name not in _PLACE:
+            return now
+        if item.kind == "report_freeze":
             return replace(now, position=kept.position, velocity=kept.velocity)
-        if item.kind == "report_stale" and name in _PLACE:
+        if item.kind == "report_stale":
             return replace(now, position=kept.position, velocity=kept.velocity, time_s=kept.time_s)
         if item.kind == "report_velocity":
-            north, east, down = now.velocity
-            return replace(now, velocity=(north + item["x_m_s"], east + item["y_m_s"], down + item["z_m_s"]))
-        if item.kind == "report_backwards":
-            return replace(now, time_s=now.time_s - item["step_s"])
-        if item.kind == "report_clock":
-            return replace(now, time_s=max(0.0, now.time_s + item["step_s"]))
-        if item.kind == "report_reset":
-            x, y, z = now.position
-            return replace(now, position=(x + item["x_m"], y + item["y_m"], z + item["z_m"]))
-        return now
+            return replace(now, velocity=_moved(now.velocity, item, "m_s"))
+        return replace(now, position=_moved(now.position, item, "m")) if item.kind == "report_reset" else now
 
     def alter(self, name: str, message: Message, now_s: float) -> None:
         """Change the finished message."""
@@ -61,6 +59,11 @@ class ReportFaults:
             message.pos_horiz_accuracy = _ACCURACY_M + self._motion.accuracy_m(now_s)
         for item in self._schedule.group(REPORT, now_s):
             _alter(item, name, message)
+
+
+def _moved(vector: Vector, item: Active, unit: str) -> Vector:
+    x, y, z = vector
+    return (x + item[f"x_{unit}"], y + item[f"y_{unit}"], z + item[f"z_{unit}"])
 
 
 def _alter(item: Active, name: str, message: Message) -> None:

@@ -89,7 +89,7 @@ def _share(scan: Scan, item: Active, generator: np.random.Generator) -> NDArray[
 
 
 def _noise(scan: Scan, item: Active, generator: np.random.Generator) -> NDArray[np.floating]:
-    noisy = scan.ranges_m + item["sigma_m"] * generator.standard_normal(scan.ranges_m.size)
+    noisy: NDArray[np.floating] = scan.ranges_m + item["sigma_m"] * generator.standard_normal(scan.ranges_m.size)
     too_near = np.isfinite(noisy) & (noisy < scan.range_min_m)
     return np.where(too_near, 0.0, np.where(noisy > scan.range_max_m, np.inf, noisy))
 

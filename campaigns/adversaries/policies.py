@@ -260,7 +260,7 @@ def vertical(scene: Scene, random: Generator) -> Policy:
             way[:] = random.uniform(-1.0, 1.0, 2) * random.choice((0.0, 1.0))
         if random.random() < 0.02:
             up[0] = -up[0]
-        return command(*(FAST_M_S * way), FAST_M_S * up[0], 0.0)
+        return command(FAST_M_S * way[0], FAST_M_S * way[1], FAST_M_S * up[0], 0.0)
 
     return policy
 

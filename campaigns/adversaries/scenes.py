@@ -76,7 +76,7 @@ class _Builder:
         low, high = self.fence.corners.min(axis=0), self.fence.corners.max(axis=0)
         placed: list[tuple[float, float, float]] = []
         for _ in range(20 * count):
-            x, y, width = *self.random.uniform(low, high), self.random.uniform(*widths)
+            (x, y), width = self.random.uniform(low, high), self.random.uniform(*widths)
             near = any(max(abs(x - a), abs(y - b)) < 0.5 * (width + w) + apart_m for a, b, w in placed)
             if not near:
                 placed.append((float(x), float(y), float(width)))
@@ -207,7 +207,8 @@ def _start(boxes: Array, fence: FenceShape, random: np.random.Generator) -> Plac
     low, high = fence.corners.min(axis=0), fence.corners.max(axis=0)
     furthest = 0.8 if random.random() < 0.5 else math.inf
     for _ in range(_TRIES):
-        place = (*map(float, random.uniform(low, high)), float(random.uniform(fence.z_low_m + 0.4, fence.z_high_m - 0.4)))
+        (x, y), z = random.uniform(low, high), random.uniform(fence.z_low_m + 0.4, fence.z_high_m - 0.4)
+        place = (float(x), float(y), float(z))
         to_boxes, to_fence = clearance_m(boxes, np.array(place), 0.35), fence.margin_m(place, 0.35, 0.1)
         if to_boxes >= START_TO_BOXES_M and to_fence >= START_CLEARANCE_M and min(to_boxes, to_fence) <= furthest:
             return place

@@ -40,7 +40,9 @@ def _realtime(arguments: argparse.Namespace) -> dict[str, Any]:
     from campaigns.faults.realtime import fly_all
 
     only = arguments.only.split(",") if arguments.only else None
-    return fly_all(arguments.mission, only, "python -m campaigns.faults " + " ".join(sys.argv[1:]))
+    return fly_all(
+        arguments.mission, only, "python -m campaigns.faults " + " ".join(sys.argv[1:]), lambda r: _keep(r, arguments.out)
+    )
 
 
 def main() -> int:
@@ -56,11 +58,15 @@ def main() -> int:
     return 0 if not result["wrong"] else 1
 
 
+def _keep(result: dict[str, Any], out: Path) -> None:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps(result, indent=1) + "\n")
+
+
 def _write(result: dict[str, Any], out: Path) -> None:
     from campaigns.faults.report import draw, markdown
 
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(result, indent=1) + "\n")
+    _keep(result, out)
     out.with_suffix(".md").write_text(markdown(result) + "\n")
     draw(result, out.with_suffix(".png"))
 

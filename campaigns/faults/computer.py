@@ -30,6 +30,7 @@ from sim_gateway.vehicle import STEP_S
 CLOCK_OFFSET_S = 1000.0
 GUARD_COMPONENT = 192
 RESEND_S, RESENDS = 0.5, 3
+LOOK_S = 0.05
 _VELOCITY_AND_YAW_RATE = 0x5C7
 _MODE_MESSAGES = ("HEARTBEAT", "CURRENT_MODE")
 
@@ -287,17 +288,17 @@ class LockstepLidar:
         self._retry_s = -math.inf
         self._pause_s = config.reconnect_min_s
         self._stop = threading.Event()
+        self._look_s = -math.inf
+        computer.every_step.append(self._listen)
 
     def latest(self) -> LidarScan | None:
         """The newest scan."""
-        self._read()
         return self._scan
 
     def wait_for_scan(self, timeout_s: float) -> LidarScan | None:
         """The next scan to arrive."""
         before, deadline = self.scans, self._computer.now_s + timeout_s
         while self._computer.now_s < deadline:
-            self._read()
             if self.scans != before:
                 return self._scan
             self._computer.sleep(STEP_S)
@@ -307,6 +308,14 @@ class LockstepLidar:
         """What preflight reads."""
         age_s = self._computer.now_s - self._scan.time_s if self._scan is not None else math.nan
         return LidarHealth(self._session is not None, 20.0, age_s, self.scans, 0, 0, 0, 0.0, 0.0, "", "")
+
+    def _listen(self) -> None:
+        """As the driver's thread: at once when bytes arrive, and now and then to see that none do."""
+        computer, arrived = self._computer, self._computer.air.lidar_bytes
+        due = bool(arrived) and arrived[0][0] <= computer.air.time_s
+        if not computer.frozen and (due or computer.now_s >= self._look_s):
+            self._look_s = computer.now_s + LOOK_S
+            self._read()
 
     def _read(self) -> None:
         if self._computer.now_s < self._retry_s:

@@ -37,7 +37,7 @@ def judge(trace: Trace, expected: Expected) -> Verdict:
     reaction_s, problem = _JUDGES[expected.reaction](trace, expected)
     if problem is None and reaction_s is not None and reaction_s > expected.bound_s + ROUNDING_S:
         problem = f"{1e3 * reaction_s:.0f} ms, bound {1e3 * expected.bound_s:.0f} ms"
-    if problem is None and expected.rules and not set(expected.rules) & set(rules):
+    if problem is None and expected.rules and not trace.refused and not set(expected.rules) & set(rules):
         problem = f"named {', '.join(rules) or 'nothing'}, not {' or '.join(expected.rules)}"
     problem = problem or _unsafe(trace, expected)
     outcome = trace.ending.outcome if trace.ending is not None else "flying"
@@ -50,7 +50,7 @@ def moving(setpoint: Velocity) -> bool:
 
 
 def _until(trace: Trace, expected: Expected) -> float:
-    return trace.felt_s + expected.window_s
+    return min(trace.felt_s + expected.window_s, max(trace.over_s, trace.felt_s))
 
 
 def _rules(trace: Trace, expected: Expected) -> tuple[str, ...]:

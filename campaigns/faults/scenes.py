@@ -35,14 +35,19 @@ class Scene:
     does: str
     wants: Callable[[float], Action]
     begins_s: tuple[float, float]
-    boxes: tuple[NDArray[np.float64], ...]
+    boxes: tuple[list[float], ...]
     fence: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-1.0, -2.9, 0.5), (9.0, 2.2, 4.0))
+
+    @property
+    def before_offboard(self) -> bool:
+        """Whether the fault begins before the loop: it is felt when the loop begins."""
+        return self.begins_s[1] < 0.0
 
     def world(self, seed: int) -> World:
         """Where it happens; the start varies with the seed."""
         shift = np.random.default_rng([seed, 5]).uniform(-0.15, 0.15, 2)
         start = (_START[0] + float(shift[0]), _START[1] + float(shift[1]), 0.0)
-        return World(self.name, seed, 16.0, 5.4, 4.0, np.vstack(self.boxes), (), start, 0.0, (30.0, -0.5, HEIGHT_M))
+        return World(self.name, seed, 16.0, 5.4, 4.0, np.array(self.boxes), (), start, 0.0, (30.0, -0.5, HEIGHT_M))
 
     def safety(self, mission: Mission) -> SafetyConfig:
         """The mission's safety limits around this place."""

@@ -43,14 +43,16 @@ class ProcessDeathError(BaseException):
 
 @dataclass(slots=True)
 class Trace:
-    """What one run left behind. Times are vehicle time; `begin_s`: of the fault; `felt_s`: first faulty sample at the computer.
+    """What one run left behind. Times are vehicle time; `begin_s`, `over_s`: of the fault; `felt_s`: first faulty sample felt.
 
     `sent`: setpoints as they left the computer, NED m/s and rad/s; `commands`: (time, MAV_CMD, parameters 2 and 3) that fly sent;
-    `modes`: (time, mode, in failsafe) of the autopilot; `fence_margin_m`: least distance of the hull to the fence.
+    `modes`: (time, mode, in failsafe) of the autopilot; `fence_margin_m`: least distance of the hull to the fence; `refused`: the
+    loop never ran, so the safety layer was not asked.
     """
 
     begin_s: float
     felt_s: float = math.nan
+    over_s: float = math.inf
     offboard_s: float = math.nan
     setpoints: list[Setpoint] = field(default_factory=list)
     sent: list[tuple[float, Velocity]] = field(default_factory=list)
@@ -58,6 +60,7 @@ class Trace:
     commands: list[tuple[float, int, float, float]] = field(default_factory=list)
     records: list[tuple[float, TickRecord]] = field(default_factory=list)
     ending: Ending | None = None
+    refused: bool = False
     contacts: int = 0
     fence_margin_m: float = math.inf
     end_s: float = 0.0
@@ -184,7 +187,7 @@ class Stage:
         safety, place = self.safety, air.simulation.truth_position_m
         hull = (safety.vehicle_radius_m, safety.vehicle_radius_m, safety.vehicle_half_height_m)
         for axis in range(3):
-            margins = [safety.fence.max_m[axis] - place[axis], place[axis] - safety.fence.min_m[axis]]
+            margins = [safety.fence.high_m[axis] - place[axis], place[axis] - safety.fence.low_m[axis]]
             lands = axis == 2 and air.autopilot.mode is not FlightMode.OFFBOARD
             trace.fence_margin_m = min(trace.fence_margin_m, min(margins[:1] if lands else margins) - hull[axis])
 
@@ -194,6 +197,7 @@ class Stage:
         trace.sent = self.link.lockstep_guard.sent
         trace.commands = self.link.direct.commands
         trace.contacts = air.simulation.contacts
+        trace.refused = not trace.records
         return trace
 
 

@@ -216,7 +216,8 @@ def serve(url: str, control: socket.socket, priority: int) -> None:
     signal.signal(signal.SIGTERM, guard.on_signal)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is for `fly`, which lands
     _be_quick(priority)
-    control.send(bytes((Kind.READY,)) + relay.getsockname()[1].to_bytes(2, "little"))
+    with contextlib.suppress(OSError):  # a loop that is gone by now shows as the end of the socket
+        control.send(bytes((Kind.READY,)) + relay.getsockname()[1].to_bytes(2, "little"))
     with contextlib.suppress(PortError):  # the end of the wire is the end of this process: the loop sees that
         guard.run(wake)
 

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import development as mav
 
-from campaigns.process_death import CELLS, Cell, Run, judge, markdown, summarise
+from campaigns.death_scene import CELLS, Cell
+from campaigns.process_death import Run, judge, markdown, summarise
 from campaigns.wire_tap import ByteTap, Seen, Setpoint, WireTap
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -130,6 +130,17 @@ def test_frozen_estimate_while_commanded():
     assert rules(moved, commanded=0.5)[11] == ["estimate_frozen"]
 
 
+def test_a_frozen_estimate_stays_one_when_nothing_is_commanded_any_more():
+    """E2: braking must not make it look healthy; the first new bit does."""
+    monitor, faults = EstimateMonitor(C), []
+    for k in range(30):
+        found = []
+        sample = state(v=(0.2, 0, 0) if k < 20 else (0.2, 1e-12, 0), time_s=k * 0.05)
+        monitor.judge(sample, Health(), 0.5 if k < 8 else 0.0, k * 0.05, found)
+        faults.append([item.rule for item in found])
+    assert faults == [[]] * 5 + [["estimate_frozen"]] * 15 + [[]] * 10
+
+
 def test_the_same_sample_twice_is_neither_frozen_nor_a_jump():
     one = state(v=(0.2, 0, 0), time_s=1.0)
     assert not any(rules([one] * 20, commanded=1.0))

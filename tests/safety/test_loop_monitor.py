@@ -116,10 +116,18 @@ def test_the_same_echo_again_is_not_judged_again():
     assert not any(rules([Health(echo=CorridorVector(0, -1, 0))] * 40, history=sent()))
 
 
-def test_one_echo_of_ours_clears_the_suspicion():
-    foreign = CorridorVector(0, -1, 0)
-    mixed = [Health(echo=FLOWN if k % 9 == 8 else foreign, echo_time_s=8.0 + k * TICK) for k in range(40)]
-    assert not any(rules(mixed, history=sent()))
+def test_foreign_setpoints_between_ours_are_seen_and_a_few_accuse_nobody():
+    """K6: a second sender at the same rate is echoed in turn with us; six foreign echoes within 1 s, over 0.6 s, are enough."""
+
+    def mixed(every: int) -> list[list[str]]:
+        foreign = CorridorVector(0, -1, 0)
+        told = [Health(echo=foreign if k % every == 0 else FLOWN, echo_time_s=8.0 + k * TICK) for k in range(40)]
+        return rules(told, history=sent())
+
+    first = next(k for k, names in enumerate(mixed(2)) if names)
+    assert first * TICK == pytest.approx(C.echo_s, abs=TICK)
+    assert any(mixed(3))
+    assert not any(mixed(5))
 
 
 @settings(deadline=None)

@@ -144,6 +144,17 @@ def test_frozen_scan_with_fresh_stamps_brakes_on_the_third_repeat():
     assert frozen(WALL, v=(0, 0, 0), yaw_rate=-0.5)[3:] == ["scan_frozen"] * 3
 
 
+def test_a_frozen_scan_stays_one_when_the_vehicle_has_braked():
+    """L2: until a scan differs."""
+    safety, faults = SafetyFilter(config()), []
+    for k in range(12):
+        seen, speed = (WALL if k < 9 else WALL - 0.1), (0.5 if k < 5 else 0.0)
+        sample = state(x=0.0, v=(speed, 0, 0), time_s=0.05 * k)
+        _, verdict = safety.apply(command(0.2), sample, scan(seen, 0.05 * k), 0.05 * k)
+        faults.append(verdict.fault)
+    assert [fault == "scan_frozen" for fault in faults] == [False] * 3 + [True] * 6 + [False] * 3
+
+
 def test_equal_scans_are_right_when_nothing_moves_or_nothing_is_there():
     assert frozen(WALL, v=(0.1, 0, 0)) == [None] * 6
     assert frozen(None) == [None] * 6
