@@ -13,10 +13,12 @@ fly: $(VENV)/.setup-fly  ## set up what a simulated flight needs, then fly the m
 	$(BIN)/fly --mission $(MISSION)
 
 test: $(VENV)/.setup-dev lint  ## set up everything, then lint, types and all tests
-	@echo "== tests, two at a time (simulated and pure) =="
-	$(BIN)/python -m pytest -n 2 -m "not realtime" -q || \
+	@echo "== safety layer: its own tests run every line and branch, or this fails =="
+	$(BIN)/python -m pytest -n 2 -q tests/safety --cov=safety --cov-branch --cov-report=term-missing:skip-covered --cov-fail-under=100
+	@echo "== all other tests, two at a time (simulated and pure) =="
+	$(BIN)/python -m pytest -n 2 -m "not realtime" -q --ignore tests/safety || \
 		{ echo "== what failed beside other tests, once more and alone: these machines are shared =="; \
-		  $(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m "not realtime" -q; }
+		  $(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m "not realtime" -q --ignore tests/safety; }
 	@echo "== tests that fly in real time over MAVLink, one at a time =="
 	$(BIN)/python -m pytest -m realtime -v
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from campaigns.faults.report import markdown as fault_table
 from campaigns.process_death import markdown
+from campaigns.strength import strength
 from policy_export.errors import PolicyError
 from policy_export.policy_file import PolicyFile, read_policy_file
 from sim_gateway.faults import KINDS, Kind
@@ -27,6 +28,7 @@ GATEWAY = Path("docs/gateway.md")
 FAULTS = "<!-- fault campaign -->", "<!-- end of fault campaign -->"
 FAULT_KINDS = "<!-- fault kinds -->", "<!-- end of fault kinds -->"
 PROCESS_DEATH = "<!-- process death -->", "<!-- end of process death -->"
+STRENGTH = "<!-- strength of the tests -->", "<!-- end of strength of the tests -->"
 PAPER_UNSEEN_SUCCESS = "77.4 %"
 PAPER_PATH_EFFICIENCY = "0.85"
 
@@ -131,6 +133,8 @@ def publish() -> None:
     _write_block(README, BEGIN, END, f"{table(lockstep_rows(results) + realtime_rows(results))}\n\n{note}")
     if "process_death" in results:
         _write_block(SAFETY, *PROCESS_DEATH, process_death(results["process_death"]))
+    if "mutation" in results:
+        _write_block(SAFETY, *STRENGTH, strength(results))
     flown = [results[name] for name in ("faults", "faults_realtime") if name in results]
     if flown:
         _write_block(SAFETY, *FAULTS, "\n\n".join(fault_campaign(result) for result in flown))

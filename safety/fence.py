@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +28,7 @@ MOST_CELLS = 256.0  # along one side, to begin with
 def signed_area_m2(ring: Sequence[Vertex]) -> float:
     """Area of a polygon, positive when its vertices go counter-clockwise (shoelace formula about the first vertex)."""
     x0, y0 = ring[0]
-    pairs = zip(ring, (*ring[1:], ring[0]), strict=True)
-    return 0.5 * sum((ax - x0) * (by - y0) - (bx - x0) * (ay - y0) for (ax, ay), (bx, by) in pairs)
+    return 0.5 * sum((ax - x0) * (by - y0) - (bx - x0) * (ay - y0) for (ax, ay), (bx, by) in pairwise(ring))
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,7 +72,7 @@ class CorridorFrame:
     @staticmethod
     def anchored(position_ned: NedVector, position_corridor: CorridorVector, heading_rad: float) -> CorridorFrame:
         """The frame in which the point `position_ned` has the corridor coordinates `position_corridor`."""
-        offset = CorridorFrame(NedVector(0.0, 0.0, 0.0), heading_rad).vector_to_ned(position_corridor)
+        offset = CorridorFrame(position_ned, heading_rad).vector_to_ned(position_corridor)
         origin = NedVector(position_ned.x - offset.x, position_ned.y - offset.y, position_ned.z - offset.z)
         return CorridorFrame(origin, heading_rad)
 

@@ -96,15 +96,16 @@ def _limit_growth(
     added = _minus(velocity, kept)
     step = _length(added)
     limit = config.max_acceleration_m_s2 * dt_s
-    if step > limit + ROUNDING_M_S:
+    fits = step <= limit + ROUNDING_M_S
+    if not fits:
         found.append(Intervention("acceleration_limit", step, limit))
         added = _scaled(added, limit / step)
     before, change = _scaled(last.acceleration, dt_s), config.max_jerk_m_s3 * dt_s * dt_s
     share = _share_within(added, before, change)
     if share < 1.0:
         found.append(Intervention("jerk_limit", _length(added), share * _length(added)))
-        added = _scaled(added, share)
-    return velocity if step <= limit + ROUNDING_M_S and share == 1.0 else _minus(kept, _scaled(added, -1.0))
+        added, fits = _scaled(added, share), False
+    return velocity if fits else _minus(kept, _scaled(added, -1.0))
 
 
 def _share_within(added: CorridorVector, before: CorridorVector, change: float) -> float:

@@ -1,0 +1,124 @@
+"""Limits met exactly, and passed by the least there is: what a wrong comparison would get away with."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import numpy as np
+import pytest
+from safety_plant import command, config
+
+from safety.fence import PolygonFence, polygon_fence, signed_area_m2
+from safety.frames import CorridorFrame, CorridorVector, NedVector
+from safety.limits import AT_REST, LastSent, limit_command, sent_after
+
+
+def test_frames_can_be_asked_through_an_object_too():
+    frame = CorridorFrame(NedVector(3.0, 4.0, -1.0), 0.7)
+    there, here = NedVector(1.0, -2.0, -3.0), CorridorVector(2.0, 1.0, 3.0)
+    assert frame.anchored(there, here, 0.7) == CorridorFrame.anchored(there, here, 0.7)
+    assert frame.yaw_rate_to_ned(0.25) == -0.25
+
+
+TRIANGLE = ((0.1, 0.1), (0.4, 0.1), (0.1, 0.4))
+SMALL = ((0.15, 0.15), (0.2, 0.15), (0.15, 0.2))
+
+
+@pytest.mark.parametrize("outer", [TRIANGLE, TRIANGLE[::-1]])
+@pytest.mark.parametrize("inner", [SMALL, SMALL[::-1]])
+def test_allowed_space_is_on_the_left_of_every_edge_however_small(outer, inner):
+    fence = PolygonFence(outer, (inner,))
+    areas = []
+    for number in (0, 1):
+        own = fence.edges.ring == number
+        areas.append(signed_area_m2(list(zip(fence.edges.x_m[own], fence.edges.y_m[own], strict=True))))
+    assert areas == pytest.approx([0.045, -0.00125])
+
+
+def test_a_fence_without_a_vehicle_is_not_eroded():
+    place = np.array((0.2, 0.14))
+    for fence in (polygon_fence(TRIANGLE, ()), PolygonFence(TRIANGLE, ())):
+        assert fence.room_m(place) == pytest.approx(0.04)
+    assert polygon_fence(TRIANGLE, (), 0.01, 0.02).room_m(place) == pytest.approx(0.01)
+
+
+def vector(chance, size):
+    return CorridorVector(*(chance.uniform(-size, size) for _ in range(3)))
+
+
+def distance_to_way(p, end) -> float:
+    share = np.clip(p @ end / max(end @ end, 1e-300), 0.0, 1.0)
+    return float(np.linalg.norm(p - share * end))
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_growth_is_cut_where_a_search_by_halves_cuts_it(seed):
+    """Acceleration first, then jerk: the largest share of what is left that stays near enough to the growth before."""
+    chance = random.Random(seed)
+    last = LastSent(vector(chance, 0.4), vector(chance, chance.choice((0.0, 1.0, 4.0, 9.0))))
+    wanted, dt = vector(chance, chance.choice((0.1, 0.45))), chance.choice((0.05, 0.1))
+    limits = {"max_acceleration_m_s2": chance.choice((1.0, 5.0, 50.0)), "max_jerk_m_s3": chance.choice((5.0, 60.0, 400.0))}
+    sent, found = limit_command(command(wanted.x, wanted.y, wanted.z), last, dt, 4.0, config(**limits))
+    old, new, before = (np.array((p.x, p.y, p.z)) for p in (last.velocity, wanted, last.acceleration))
+    before = before * dt
+    kept = old * min(max(float(new @ old) / float(old @ old), 0.0), 1.0)
+    added = new - kept
+    rules = []
+    if np.linalg.norm(added) > limits["max_acceleration_m_s2"] * dt + 1e-9:
+        rules.append("acceleration_limit")
+        added = added * limits["max_acceleration_m_s2"] * dt / np.linalg.norm(added)
+    change, share = limits["max_jerk_m_s3"] * dt * dt, 1.0
+    if distance_to_way(added, before) > change + 1e-9:
+        rules.append("jerk_limit")
+        low, share = 0.0, 1.0
+        for _ in range(60):
+            middle = 0.5 * (low + share)
+            low, share = (middle, share) if distance_to_way(middle * added, before) <= change else (low, middle)
+    assert [item.rule for item in found] == rules
+    result = np.array((sent.velocity.x, sent.velocity.y, sent.velocity.z))
+    assert result == pytest.approx(kept + share * added, abs=1e-8)
+    for item in found:
+        if item.rule == "jerk_limit":
+            assert (item.value, item.limit) == pytest.approx((np.linalg.norm(added), share * np.linalg.norm(added)), abs=1e-8)
+    after = sent_after(last, sent.velocity, dt).acceleration
+    again = result - old * min(max(float(result @ old) / float(old @ old), 0.0), 1.0)
+    assert (after.x, after.y, after.z) == pytest.approx(again / dt, abs=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_velocity_that_fits_is_sent_bit_for_bit_though_the_yaw_rate_is_cut(seed):
+    chance = random.Random(seed)
+    last, wanted = LastSent(vector(chance, 0.3), CorridorVector(0.0, 0.0, 0.0)), vector(chance, 0.3)
+    sent, found = limit_command(
+        command(wanted.x, wanted.y, wanted.z, 2.0), last, 0.05, 4.0, config(max_acceleration_m_s2=900.0, max_jerk_m_s3=1000.0)
+    )
+    free = math.dist((wanted.x, wanted.y, wanted.z), (last.velocity.x, last.velocity.y, last.velocity.z)) < 1.0
+    assert free
+    assert [item.rule for item in found] == ["yaw_rate_limit"]
+    assert (sent.velocity, sent.yaw_rate_rad_s) == (wanted, 1.0)
+
+
+def test_acceleration_and_jerk_met_exactly_are_free():
+    wide = config(max_horizontal_speed_m_s=4.0, max_acceleration_m_s2=8.0, max_jerk_m_s3=1000.0, lag_s=0.6)
+    just, more = 2.0 + 1e-9, math.nextafter(2.0 + 1e-9, 3.0)
+    assert limit_command(command(just), AT_REST, 0.25, 40.0, wide)[1] == ()
+    assert [item.rule for item in limit_command(command(more), AT_REST, 0.25, 40.0, wide)[1]] == ["acceleration_limit"]
+    jerky = config(max_horizontal_speed_m_s=4.0, max_acceleration_m_s2=900.0, max_jerk_m_s3=32.0)
+    assert limit_command(command(just), AT_REST, 0.25, 40.0, jerky)[1] == ()
+    assert [item.rule for item in limit_command(command(more), AT_REST, 0.25, 40.0, jerky)[1]] == ["jerk_limit"]
+
+
+def test_speed_yaw_and_climb_met_exactly_are_free():
+    exact = command(1.25, 0.0, -0.5, -1.0)
+    wide = config(max_horizontal_speed_m_s=1.25, max_acceleration_m_s2=900.0, max_jerk_m_s3=1000.0)
+    assert limit_command(exact, AT_REST, 0.25, 40.0, wide) == (exact, ())
+    above = command(math.nextafter(1.25, 2.0), 0.0, math.nextafter(-0.5, -1.0), math.nextafter(-1.0, -2.0))
+    sent, found = limit_command(above, AT_REST, 0.25, 40.0, wide)
+    assert [item.rule for item in found] == ["speed_limit", "vertical_speed_limit", "yaw_rate_limit"]
+    assert sent == exact
+    assert [(item.value, item.limit) for item in found] == [
+        (above.velocity.x, 1.25),
+        (-above.velocity.z, 0.5),
+        (-above.yaw_rate_rad_s, 1.0),
+    ]
