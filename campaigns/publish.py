@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from campaigns.faults.report import markdown as fault_table
 from campaigns.adversaries.report import section
+from campaigns.faults.report import markdown as fault_table
 from campaigns.price import markdown as price_table
 from campaigns.process_death import markdown
 from campaigns.strength import strength
