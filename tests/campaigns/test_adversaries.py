@@ -47,10 +47,16 @@ def test_the_filter_withstands_a_sample_of_the_campaign(case):
     assert outcome.changed > 0  # it was attacked
 
 
-@pytest.mark.parametrize("safety", [Unfiltered, NoDelay])
-@pytest.mark.parametrize(("scene", "kind"), [("box", "fence"), ("pillars", "contact")])
-def test_a_sabotaged_filter_is_caught(safety, scene, kind):
-    found = [flown(Case(MAIN, scene, "obstacle" if scene == "pillars" else "diagonal", seed), safety).events for seed in range(2)]
+@pytest.mark.parametrize(
+    ("safety", "scene", "policy", "kind"),
+    [
+        (Unfiltered, "box", "diagonal", "fence"),
+        (Unfiltered, "pillars", "obstacle", "contact"),
+        (NoDelay, "box", "diagonal", "fence"),
+    ],
+)
+def test_a_sabotaged_filter_is_caught(safety, scene, policy, kind):
+    found = [flown(Case(MAIN, scene, policy, seed), safety).events for seed in range(2)]
     assert any(kind in events for events in found)
 
 
