@@ -12,7 +12,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from campaigns.adversaries.report import section
 from campaigns.faults.report import markdown as fault_table
+from campaigns.price import markdown as price_table
 from campaigns.process_death import markdown
 from campaigns.strength import strength
 from policy_export.errors import PolicyError
@@ -27,6 +29,8 @@ BEGIN, END = "<!-- results -->", "<!-- end of results -->"
 GATEWAY = Path("docs/gateway.md")
 FAULTS = "<!-- fault campaign -->", "<!-- end of fault campaign -->"
 FAULT_KINDS = "<!-- fault kinds -->", "<!-- end of fault kinds -->"
+ADVERSARIES = "<!-- adversaries -->", "<!-- end of adversaries -->"
+PRICE = "<!-- price in success -->", "<!-- end of price in success -->"
 PROCESS_DEATH = "<!-- process death -->", "<!-- end of process death -->"
 STRENGTH = "<!-- strength of the tests -->", "<!-- end of strength of the tests -->"
 PAPER_UNSEEN_SUCCESS = "77.4 %"
@@ -135,6 +139,10 @@ def publish() -> None:
         _write_block(SAFETY, *PROCESS_DEATH, process_death(results["process_death"]))
     if "mutation" in results:
         _write_block(SAFETY, *STRENGTH, strength(results))
+    if "adversaries" in results:
+        _write_block(SAFETY, *ADVERSARIES, section(results["adversaries"]))
+    if "safety_price" in results:
+        _write_block(SAFETY, *PRICE, price_table(results["safety_price"]))
     flown = [results[name] for name in ("faults", "faults_realtime") if name in results]
     if flown:
         _write_block(SAFETY, *FAULTS, "\n\n".join(fault_campaign(result) for result in flown))

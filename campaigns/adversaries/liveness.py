@@ -114,7 +114,7 @@ def _dead_end(deep_m: float, leave: Callable[[View], VelocityCommand], how: str)
     start, wanted = mouth - 1.0, mouth - 0.5
     return Escape(
         f"dead end {deep_m:g} m deep, left {how}", walls, (start, 0.0), 0.0, leave, lambda view: view.place[0] < wanted,
-        way_m=deep_m + 0.5, enter_s=(deep_m + 1.0) / 0.5 + 3.0,
+        way_m=deep_m + 0.5, enter_s=(deep_m + 1.0) / 0.8 + 2.0,
     )  # fmt: skip
 
 
@@ -145,8 +145,10 @@ def _escapes() -> list[Escape]:
         _phantom("at the hull for 0.2 s, forwards", 0.36, 0.2, _forwards, _past(1.0)),
         _phantom("inside the hull for 0.2 s, forwards", 0.2, 0.2, _forwards, _past(1.0)),
         Escape("gap of 1.0 m", gap, (5.0, 0.4), 0.0, _through, lambda view: view.place[0] > BACK_X_M + 1.0, 5.0),
-        Escape("start 1 cm from a wall ahead", wall, (beside - 0.01, 0.0), 0.0, _backwards, _past(-0.5, beside), 0.5),
-        Escape("start 1 cm from a wall at the side", wall, (beside - 0.01, 0.0), 1.57, _backwards, _past(-0.5, beside), 0.5),
+        Escape("start 1 cm from a wall ahead, turned", wall, (beside - 0.01, 0.0), 0.0, _turn_and_go, _past(-0.5, beside), 0.5),
+        Escape(
+            "start 1 cm from a wall at the side, turned", wall, (beside - 0.01, 0.0), 1.57, _turn_and_go, _past(-0.5, beside), 0.5
+        ),
         Escape("start 1 cm from a wall behind", wall, (beside - 0.01, 0.0), math.pi, _backwards, _past(-0.5, beside), 0.5),
         Escape("start 0.2 m outside the fence", [], (7.0, 4.85), -1.57, _home, lambda view: view.place[1] < 4.2, 0.7),
     ]

@@ -145,3 +145,10 @@ def heat_map(block: dict[str, Any], path: Path) -> None:
 
 def _or_inf(value: float | None) -> float:
     return math.inf if value is None else value
+
+
+def section(report: dict[str, Any]) -> str:
+    """The campaign as docs/safety.md shows it."""
+    main = report["blocks"][MAIN]
+    total = f"`{report['command']}`: {main['ticks']:,} ticks of 0.05 s in {main['flights']:,} cases"
+    return f"{total}, {_none_in(main) if not main['events'] else main['events']} violations.\n\n{markdown(report)}"

@@ -47,10 +47,16 @@ def test_the_filter_withstands_a_sample_of_the_campaign(case):
     assert outcome.changed > 0  # it was attacked
 
 
-@pytest.mark.parametrize("safety", [Unfiltered, NoDelay])
-@pytest.mark.parametrize(("scene", "kind"), [("box", "fence"), ("pillars", "contact")])
-def test_a_sabotaged_filter_is_caught(safety, scene, kind):
-    found = [flown(Case(MAIN, scene, "obstacle" if scene == "pillars" else "diagonal", seed), safety).events for seed in range(2)]
+@pytest.mark.parametrize(
+    ("safety", "scene", "policy", "kind"),
+    [
+        (Unfiltered, "box", "diagonal", "fence"),
+        (Unfiltered, "pillars", "obstacle", "contact"),
+        (NoDelay, "box", "diagonal", "fence"),
+    ],
+)
+def test_a_sabotaged_filter_is_caught(safety, scene, policy, kind):
+    found = [flown(Case(MAIN, scene, policy, seed), safety).events for seed in range(2)]
     assert any(kind in events for events in found)
 
 
@@ -154,7 +160,7 @@ def test_report_of_a_small_campaign(tmp_path, monkeypatch):
     assert (tmp_path / "map.png").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("name", ["dead end 1 m deep, left backwards", "start 1 cm from a wall ahead"])
+@pytest.mark.parametrize("name", ["dead end 1 m deep, left backwards", "start 1 cm from a wall ahead, turned"])
 def test_it_gets_out_in_time(name):
     time_s, clear = ESCAPES[name].fly(1)
     assert time_s is not None
@@ -167,5 +173,5 @@ def test_a_filter_that_only_brakes_does_not_get_out():
         def apply(self, command, state, scan, now_s):
             return super().apply(None, state, scan, now_s)
 
-    time_s, _ = ESCAPES["start 1 cm from a wall ahead"].fly(1, Frozen)
+    time_s, _ = ESCAPES["start 1 cm from a wall ahead, turned"].fly(1, Frozen)
     assert time_s is None
