@@ -41,6 +41,8 @@ def test_rates_are_those_of_the_recorded_links(bench: Bench) -> None:
     for client, column in ((bench.onboard, ONBOARD), (bench.ground, GROUND)):
         counts = Counter(message.get_type() for message in client.seen)
         for name, rates in STREAM_RATES_HZ.items():
+            if name == "POSITION_TARGET_GLOBAL_INT":
+                continue  # only while there is a position target: see test_conformance
             assert counts.pop(name, 0) == pytest.approx(rates[column] * seconds, abs=1.01 + 0.01 * rates[column] * seconds), name
         assert not counts
 
