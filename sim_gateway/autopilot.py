@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from sim_gateway.battery import Battery
@@ -355,15 +356,15 @@ class Autopilot:
         if self.mode.needs_pilot:
             blind = self.mode is FlightMode.ALTCTL and self.failsafes.latched
             return DescendTask(parameters, state) if blind else PositionTask(parameters, state, self.sticks)
-        if self.mode is FlightMode.TAKEOFF:
-            return TakeoffTask(parameters, state, self._takeoff_target_down_m())
-        if self.mode is FlightMode.LAND:
-            return LandTask(parameters, state, self.home[2])
-        if self.mode is FlightMode.RTL:
-            return self._start_return()
-        if self.mode is FlightMode.MISSION and self.mission.legs:
-            return self._start_mission()
-        return HoldTask(parameters, state, self._task_target, self._task_yaw_rad)
+        starts: dict[FlightMode, Callable[[], FlightTask]] = {
+            FlightMode.TAKEOFF: lambda: TakeoffTask(parameters, state, self._takeoff_target_down_m()),
+            FlightMode.LAND: lambda: LandTask(parameters, state, self.home[2]),
+            FlightMode.RTL: self._start_return,
+        }
+        if self.mission.legs:
+            starts[FlightMode.MISSION] = self._start_mission
+        hold = HoldTask(parameters, state, self._task_target, self._task_yaw_rad)
+        return starts[self.mode]() if self.mode in starts else hold
 
     def _takeoff_target_down_m(self) -> float:
         """Down coordinate of the takeoff altitude; never below where the vehicle is."""

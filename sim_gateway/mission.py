@@ -73,14 +73,10 @@ class MissionTask:
     mission: Mission
     home: Vector
     finished: bool = False
+    landing: bool = False
     _part: FlightTask | None = None
     _flying: int = -1
     _there_since_s: float | None = None
-
-    @property
-    def landing(self) -> bool:
-        """Whether it is in its final descent."""
-        return self._part is not None and self._part.landing
 
     @property
     def target(self) -> Vector | None:
@@ -97,7 +93,9 @@ class MissionTask:
             mission.current += 1
             self._begin(state)
         assert self._part is not None
-        return self._part.update(state, dt_s)
+        command = self._part.update(state, dt_s)
+        self.landing = self._part.landing
+        return command
 
     def _begin(self, state: NedState) -> None:
         """Start the current item; those that fly nowhere are done at once."""

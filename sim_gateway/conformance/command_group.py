@@ -115,7 +115,7 @@ def _command(table: Table, name: str, recorded: Json) -> None:
     bench.command(recorded["command"], *params, component=component).run(WAIT_S)
     acks = bench.acks(recorded["command"], since_s)
     table.equal(f"{name}: first acknowledgement", recorded["ack"], acks[0] if acks else None)
-    texts = [[severity, text] for _, severity, text in bench.texts(since_s)]
+    texts = [(severity, text) for _, severity, text in bench.texts(since_s)]
     wanted = [t for t in recorded["texts"] if not t[1].startswith("[logger]")]
     hidden = [numbers_hidden(text for _, text in side) for side in (wanted, texts)]
     table.equal(f"{name}: texts", hidden[0], hidden[1])
@@ -296,16 +296,16 @@ def _override(table: Table, case: str, recorded: Json) -> None:
     since_s = bench.time_s
     client = _do_override(bench, case)
     bench.run(4.0)
-    modes = [list(m) for m in bench.modes(since_s)]
-    table.equal(f"{case}: modes", [m[1:] for m in recorded["modes"]], [m[1:] for m in modes])
+    modes = bench.modes(since_s)
+    table.equal(f"{case}: modes", [m[1:] for m in recorded["modes"]], [list(m[1:]) for m in modes])
     for wanted, got in zip(recorded["modes"], modes, strict=False):
         if "returns" not in case:
             table.within(f"{case}: {wanted[1]}, s", [wanted[0]], got[0], EVENT_S)
     table.equal(f"{case}: mode in the end", recorded["mode_end"], bench.mode)
     if recorded["acks"]:
         table.equal(f"{case}: acknowledgements", recorded["acks"], bench.acks(_SET_MODE, since_s, client))
-    texts = [[severity, text] for _, severity, text in bench.texts(since_s)]
-    table.equal(f"{case}: texts", numbers_hidden(t[1] for t in recorded["texts"]), numbers_hidden(t[1] for t in texts))
+    texts = [text for _, _, text in bench.texts(since_s)]
+    table.equal(f"{case}: texts", numbers_hidden(t[1] for t in recorded["texts"]), numbers_hidden(texts))
     table.within(f"{case}: velocity north in the end, m/s", [recorded["vel_end"][0]], bench.pilot.state.velocity[0], SPEED_M_S)
 
 

@@ -186,7 +186,7 @@ def _geofence(data: Json) -> Json:
 def _failures(data: Json) -> Json:
     runs = {}
     for run in data["runs"]:
-        states = []
+        states: list[list[float]] = []
         for at, percent, _, _, state in run["battery_changes_t_pct_mV_cA_chargestate"]:
             if not states or states[-1][1] != state:
                 states.append([at, state, percent])
