@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from sim_gateway.battery import Battery, Charge
-from sim_gateway.flight_modes import AUTO_MAIN_MODE, FlightMode, LandedState, Result, SystemStatus
+from sim_gateway.battery import Battery
+from sim_gateway.failsafes import Failsafes
+from sim_gateway.flight_modes import AUTO_MAIN_MODE, CRITICAL, INFO, FlightMode, LandedState, Result, SystemStatus
 from sim_gateway.flight_tasks import (
     DescendTask,
     FlightTask,
@@ -25,6 +27,7 @@ from sim_gateway.flight_tasks import (
     TakeoffTask,
 )
 from sim_gateway.local_frame import DEFAULT_ALTITUDE_M, NedState, Vector
+from sim_gateway.mission import Mission, MissionTask
 from sim_gateway.parameters import ParameterStore
 from sim_gateway.setpoints import OffboardSetpoint
 from sim_gateway.sticks import Sticks, moved
@@ -32,27 +35,15 @@ from sim_gateway.sticks import Sticks, moved
 CONTROL_PERIOD_S = 0.02  # PX4's flight tasks run at 50 Hz
 FORCE_MAGIC = 21196  # param 2 of MAV_CMD_COMPONENT_ARM_DISARM: skip the checks
 READY_AFTER_S = 4.3  # recorded: arming is denied until about here
-# MAV_SEVERITY
-CRITICAL, ERROR, INFO = 2, 3, 6
 
 _ARMING_DENIED = "Arming denied: Resolve system health failures first"
 _LANDING_DETECT_S = 1.8  # recorded 1.7 to 2.3 s from touch down to "Landing detected"
 _CLIMB_WANTED_M_S = 0.05
+_LIFT_OFF_S = 0.35  # recorded: takeoff is detected about that long after the motors have spooled up
 _RAMP_START_M_S = 0.9  # the takeoff ramp starts as if descending, so that thrust comes up from its minimum
 _KEPT_TEXTS = 200
-_OBL_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.LOITER}  # COM_OBL_RC_ACT; all others fall back to RTL without a pilot
-_OBL_STOP_MOTORS = (6, 7)
 _OVERRIDE_AUTO, _OVERRIDE_OFFBOARD = 1, 2  # bits of COM_RC_OVERRIDE
-_EXCEPT_HOLD, _EXCEPT_OFFBOARD = 2, 4  # bits of COM_RCL_EXCEPT
 _STICKS_DISABLED, _RADIO_ONLY = 4, 0  # COM_RC_IN_MODE values that ignore MANUAL_CONTROL
-_GPS_GIVEN_UP_S = 5.1  # recorded 5.1 and 5.2 s
-_BATTERY_TEXTS = {
-    Charge.LOW: (CRITICAL, "Low battery"),
-    Charge.CRITICAL: (CRITICAL, "Critical battery level"),
-    Charge.EMERGENCY: (0, "Emergency battery level"),
-}
-_LOW_BATTERY_ACTIONS = {2: FlightMode.LAND, 3: FlightMode.RTL}  # COM_LOW_BAT_ACT
-_RCL_ACTIONS = {2: FlightMode.RTL, 3: FlightMode.LAND}  # NAV_RCL_ACT; 1 stays in Hold
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +93,12 @@ class Autopilot:
         self.texts: deque[StatusText] = deque(maxlen=_KEPT_TEXTS)
         self.mode_changes: deque[ModeChange] = deque(maxlen=_KEPT_TEXTS)
         self.battery = Battery()
-        self.gps_fix = True
+        self.gps_fix = True  # cleared by faults
         self.refuses_offboard = False
         self._start_up_s = ready_after_s
         self._altitude_amsl_m = altitude_amsl_m
+        self.failsafes = Failsafes(self)
+        self.mission = Mission()
         self._forget(0.0)
 
     def _forget(self, now_s: float) -> None:
@@ -133,10 +126,7 @@ class Autopilot:
         self._landed_at_s = 0.0
         self._last_step_s: float | None = None
         self.sticks = Sticks()
-        self._pilot_lost_s: float | None = None
-        self._gps_lost_s: float | None = None
-        self._low_since_s: float | None = None
-        self._latched = False  # in a failsafe that a setpoint stream does not end
+        self.failsafes.clear()
 
     # ---- what telemetry reports
 
@@ -165,11 +155,6 @@ class Autopilot:
     def has_pilot(self) -> bool:
         """Whether stick input came within COM_RC_LOSS_T."""
         return self.now_s - self.sticks.time_s < self.parameters.get("COM_RC_LOSS_T")
-
-    @property
-    def position_given_up(self) -> bool:
-        """Whether GPS has been away for so long that the position estimate is no longer used."""
-        return self._gps_lost_s is not None and self.now_s - self._gps_lost_s >= _GPS_GIVEN_UP_S
 
     @property
     def system_status(self) -> SystemStatus:
@@ -228,7 +213,7 @@ class Autopilot:
         if not self.landed and not force:
             self.say(CRITICAL, "Disarming denied: not landed")
             return Result.TEMPORARILY_REJECTED
-        self._disarm("external command")
+        self.stop_motors("external command")
         return Result.ACCEPTED
 
     def set_mode_numbers(self, main: int, sub: int, from_pilot: bool = False) -> Result:
@@ -278,12 +263,21 @@ class Autopilot:
         self._task_yaw_rad = yaw_rad
         return Result.ACCEPTED
 
-    def fail_into(self, mode: FlightMode, text: str = "Failsafe activated") -> None:
-        """A failsafe of PX4's own takes the vehicle over; only a mode command ends it."""
-        self.failsafe = self._latched = True
+    def enter_failsafe(self, mode: FlightMode) -> None:
+        """A failsafe takes the vehicle over; the intended mode stays."""
+        self.failsafe = True
         self._task_target = self._task_yaw_rad = None
-        self.say(CRITICAL, text)
         self._enter(mode)
+
+    def leave_failsafe(self) -> None:
+        """Its reason has gone: back to the intended mode."""
+        self.failsafe = False
+        self._enter(self.intended)
+
+    def begin_in_air(self, state: NedState, home: Vector) -> None:
+        """Start flying: armed, in Hold, with the takeoff behind it."""
+        self.step(state)
+        self.armed, self.landed, self._flown, self.home = True, False, True, home
 
     def restart(self) -> None:
         """Power lost and back: motors off, everything but the parameters forgotten."""
@@ -304,13 +298,11 @@ class Autopilot:
         self.state = state
         if self._setpoint_fresh:  # it came between the last step and this one: the stream's clock starts now
             self._setpoint_time_s, self._setpoint_fresh = state.time_s, False
+        self.failsafes.watch(dt_s)
         if not self.armed:
             self.landed = self.landed or state.on_ground
             return self.output
-        self._check_pilot_loss()
-        self._check_gps()
-        self._check_battery()
-        self._check_offboard_loss()
+        self.failsafes.check()
         if not self.armed:
             return self.output
         if self._task is None:
@@ -328,23 +320,25 @@ class Autopilot:
         was_landing = task.landing
         command = task.update(self.state, dt_s)
         self.target = command.target
-        if task.landing and not was_landing:
+        if task.landing and not was_landing and isinstance(task, ReturnTask):
             self.say(INFO, "RTL: land at destination")
-        if isinstance(task, TakeoffTask) and task.finished:
-            self._task_target, self._task_yaw_rad = task.target, task.state_at_entry.yaw_rad
+        if isinstance(task, TakeoffTask | MissionTask) and task.finished:
+            self._task_target = task.target
+            self._task_yaw_rad = self.state.yaw_rad if isinstance(task, MissionTask) else task.state_at_entry.yaw_rad
             self._intend(FlightMode.LOITER)
         return command
 
     def _can_fly(self, mode: FlightMode) -> bool:
         if mode is FlightMode.OFFBOARD:
             return self.stream_alive and not self.refuses_offboard
-        return self.has_pilot if mode.needs_pilot else mode is not FlightMode.MISSION
+        return self.has_pilot if mode.needs_pilot else mode is not FlightMode.MISSION or bool(self.mission.legs)
 
     def _intend(self, mode: FlightMode) -> None:
         self.intended = mode
         if mode not in (FlightMode.LAND, FlightMode.RTL):
             self._after_disarming = mode
-        self.failsafe, self._pilot_lost_s, self._latched = False, None, False
+        self.failsafe = False
+        self.failsafes.clear()
         self._enter(mode)
 
     def _enter(self, mode: FlightMode) -> None:
@@ -360,15 +354,17 @@ class Autopilot:
         if self.mode is FlightMode.OFFBOARD:
             return OffboardTask(parameters, self._setpoint)
         if self.mode.needs_pilot:
-            blind = self.mode is FlightMode.ALTCTL and self._latched
+            blind = self.mode is FlightMode.ALTCTL and self.failsafes.latched
             return DescendTask(parameters, state) if blind else PositionTask(parameters, state, self.sticks)
-        if self.mode is FlightMode.TAKEOFF:
-            return TakeoffTask(parameters, state, self._takeoff_target_down_m())
-        if self.mode is FlightMode.LAND:
-            return LandTask(parameters, state, self.home[2])
-        if self.mode is FlightMode.RTL:
-            return self._start_return()
-        return HoldTask(parameters, state, self._task_target, self._task_yaw_rad)
+        starts: dict[FlightMode, Callable[[], FlightTask]] = {
+            FlightMode.TAKEOFF: lambda: TakeoffTask(parameters, state, self._takeoff_target_down_m()),
+            FlightMode.LAND: lambda: LandTask(parameters, state, self.home[2]),
+            FlightMode.RTL: self._start_return,
+        }
+        if self.mission.legs:
+            starts[FlightMode.MISSION] = self._start_mission
+        hold = HoldTask(parameters, state, self._task_target, self._task_yaw_rad)
+        return starts[self.mode]() if self.mode in starts else hold
 
     def _takeoff_target_down_m(self) -> float:
         """Down coordinate of the takeoff altitude; never below where the vehicle is."""
@@ -380,82 +376,23 @@ class Autopilot:
             down = self.home[2] - height
         return min(down, self.state.position[2])
 
+    def _start_mission(self) -> MissionTask:
+        if self.mission.complete:
+            self.mission.set_current(0)
+        return MissionTask(self.parameters, self.state, self.mission, self.home)
+
     def _start_return(self) -> ReturnTask:
         task = ReturnTask(self.parameters, self.state, self.home)
         above_sea_m = self._altitude_amsl_m - self.home[2] + task.return_height_m
         self.say(INFO, f"RTL: start return at {int(above_sea_m)} m ({int(task.return_height_m)} m above destination)")
         return task
 
-    def _check_offboard_loss(self) -> None:
-        """The failsafe of OFFBOARD: acts when the stream is lost, gives the vehicle back when it resumes."""
-        if self.intended is not FlightMode.OFFBOARD or self._pilot_lost_s is not None or self._latched:
-            return
-        if self.failsafe and self.stream_alive:
-            self.failsafe = False
-            self._enter(FlightMode.OFFBOARD)
-        elif not self.failsafe and not self.stream_alive:
-            self.failsafe = True
-            self.say(CRITICAL, "Failsafe activated")
-            action = int(self.parameters.get("COM_OBL_RC_ACT"))
-            self._task_target = self._task_yaw_rad = None
-            fallback = FlightMode.POSCTL if action == 0 and self.has_pilot else FlightMode.RTL
-            self._enter(_OBL_ACTIONS.get(action, fallback))
-            if action in _OBL_STOP_MOTORS:
-                self._disarm("failsafe")
-
-    def _check_gps(self) -> None:
-        """Without GPS the position estimate is given up after a while: a level descent that HEARTBEAT shows as ALTCTL."""
-        if self.gps_fix:
-            self._gps_lost_s = None
-        elif self._gps_lost_s is None:
-            self._gps_lost_s = self.now_s
-        elif self.now_s - self._gps_lost_s >= _GPS_GIVEN_UP_S and not self._latched:
-            self.fail_into(FlightMode.ALTCTL)
-
-    def _check_battery(self) -> None:
-        """Warnings as the charge falls; at critical, where COM_LOW_BAT_ACT says so, Hold for COM_FAIL_ACT_T, then its action."""
-        state, action = self.battery.judge(self.parameters), int(self.parameters.get("COM_LOW_BAT_ACT"))
-        if state > self.battery.charge_state:
-            self.battery.charge_state = state
-            self.say(*_BATTERY_TEXTS[state])
-        if state < Charge.CRITICAL or action not in _LOW_BATTERY_ACTIONS:
-            return
-        if self._low_since_s is None:
-            self._low_since_s = self.now_s
-            seconds = self.parameters.get("COM_FAIL_ACT_T")
-            self.fail_into(FlightMode.LOITER, f"Failsafe activated: entering Hold for {seconds:.0f} seconds")
-        elif self.now_s - self._low_since_s >= self.parameters.get("COM_FAIL_ACT_T") and self.mode is FlightMode.LOITER:
-            self.fail_into(FlightMode.LAND if state is Charge.EMERGENCY else _LOW_BATTERY_ACTIONS[action])
-
-    def _check_pilot_loss(self) -> None:
-        """The failsafe of a pilot who was there and is gone: Hold at once, NAV_RCL_ACT after COM_FAIL_ACT_T."""
-        get = self.parameters.get
-        action = int(get("NAV_RCL_ACT"))
-        if self._pilot_lost_s is not None:
-            if self.mode is FlightMode.LOITER and self.now_s - self._pilot_lost_s >= get("COM_FAIL_ACT_T") and action != 1:
-                self._enter(_RCL_ACTIONS.get(action, FlightMode.LOITER))
-            return
-        if self.has_pilot or not math.isfinite(self.sticks.time_s) or self._pilot_may_be_absent(action):
-            return
-        self.failsafe, self._pilot_lost_s = True, self.now_s
-        self._task_target = self._task_yaw_rad = None
-        self.say(CRITICAL, f"Failsafe activated: entering Hold for {get('COM_FAIL_ACT_T'):.0f} seconds")
-        self._enter(FlightMode.LOITER)
-
-    def _pilot_may_be_absent(self, action: int) -> bool:
-        if self.mode.needs_pilot:
-            return False
-        excepted = int(self.parameters.get("COM_RCL_EXCEPT"))
-        if self.mode is FlightMode.OFFBOARD:
-            return action == 0 or bool(excepted & _EXCEPT_OFFBOARD)
-        return self.mode is not FlightMode.LOITER or action == 0 or self.failsafe or bool(excepted & _EXCEPT_HOLD)
-
     def _through_takeoff_ramp(self, command: MotionCommand) -> ControlOutput:
         """Hold a climb back while motors spool up (COM_SPOOLUP_TIME), then let its speed grow over MPC_TKO_RAMP_T."""
         get, now_s = self.parameters.get, self.now_s
         north, east, down = command.velocity
         wants_climb = down < -_CLIMB_WANTED_M_S
-        if self.landed and not (wants_climb and now_s - self._armed_at_s >= get("COM_SPOOLUP_TIME")):
+        if self.landed and not (wants_climb and now_s - self._armed_at_s >= get("COM_SPOOLUP_TIME") + _LIFT_OFF_S):
             return ControlOutput(True)
         if self.landed:
             self.landed, self._flown, self._ramp_start_s = False, True, now_s
@@ -473,8 +410,9 @@ class Autopilot:
         now_s, get = self.now_s, self.parameters.get
         if self.landed:
             delay_s = get("COM_DISARM_LAND") if self._flown else get("COM_DISARM_PRFLT")
-            if delay_s > 0.0 and now_s - (self._landed_at_s if self._flown else self._armed_at_s) >= delay_s:
-                self._disarm("landing" if self._flown else "auto preflight disarming")
+            ready_s = self._landed_at_s if self._flown else self._armed_at_s + get("COM_SPOOLUP_TIME")
+            if delay_s > 0.0 and now_s - ready_s >= delay_s:
+                self.stop_motors("landing" if self._flown else "auto preflight disarming")
             return
         resting = self.state.on_ground and self.output.velocity[2] > -_CLIMB_WANTED_M_S and self._ramp_start_s is None
         if not resting:
@@ -485,7 +423,7 @@ class Autopilot:
             self.landed, self._landed_at_s, self._ground_since_s = True, now_s, None
             self.say(INFO, "Landing detected")
 
-    def _disarm(self, reason: str) -> None:
+    def stop_motors(self, reason: str) -> None:
         """Motors off; the mode falls back to the last one intended that may be armed in."""
         self.armed = self.failsafe = False
         self.landed = self.landed or self.state.on_ground

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.autopilot import FORCE_MAGIC, Autopilot
 from sim_gateway.faults import Fault, FaultSchedule
-from sim_gateway.flight_modes import AUTO_MAIN_MODE, Result
+from sim_gateway.flight_modes import AUTO_MAIN_MODE, FlightMode, Result
 from sim_gateway.local_frame import LocalFrame, Vector
 from sim_gateway.telemetry import Message, Telemetry
 
@@ -20,7 +20,7 @@ _CUSTOM_MODE_FLAG = 1
 # MAV_CMD_INJECT_FAILURE: unit to faults. PX4's simplest simulator takes the motor and shows no effect.
 _FAILURES: dict[int, tuple[tuple[str, dict[str, float]], ...]] = {
     mav.FAILURE_UNIT_SENSOR_GPS: (("gps_loss", {}),),
-    mav.FAILURE_UNIT_SYSTEM_BATTERY: (("battery", {"fraction": 0.04}),),
+    mav.FAILURE_UNIT_SYSTEM_BATTERY: (("battery", {"fraction": 0.0, "slowly": 1.0}),),
     mav.FAILURE_UNIT_SYSTEM_MOTOR: (),
 }
 
@@ -80,6 +80,8 @@ class CommandHandler:
             mav.MAV_CMD_NAV_LAND: lambda _, __: autopilot.land(),
             mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _, __: autopilot.return_to_launch(),
             mav.MAV_CMD_DO_SET_MODE: self._set_mode,
+            mav.MAV_CMD_MISSION_START: lambda command, _: autopilot.set_mode(FlightMode.MISSION, command.from_pilot),
+            mav.MAV_CMD_DO_SET_MISSION_CURRENT: self._set_mission_current,
             mav.MAV_CMD_DO_REPOSITION: self._reposition,
             mav.MAV_CMD_DO_CHANGE_SPEED: self._change_speed,
             mav.MAV_CMD_DO_SET_HOME: self._set_home,
@@ -144,6 +146,9 @@ class CommandHandler:
     def _terminate(self, command: Command, _: Link) -> Result:
         return self._autopilot.disarm(force=True) if command.p1 > 0.5 else Result.DENIED
 
+    def _set_mission_current(self, command: Command, _: Link) -> Result:
+        return Result.ACCEPTED if self._autopilot.mission.set_current(whole(command.p1)) else Result.DENIED
+
     def _inject_failure(self, command: Command, _: Link) -> Result | None:
         """Units that this vehicle can lose; for all others there is no acknowledgement, as recorded (failures.json)."""
         if self.schedule is None or int(self._autopilot.parameters.get("SYS_FAILURE_EN")) != 1:
@@ -157,6 +162,7 @@ class CommandHandler:
                 self.schedule.add(Fault(kind=name, start_s=now_s, parameters=parameters))
             else:
                 self.schedule.end(name, now_s)
+                self._autopilot.battery.recover()
         return Result.ACCEPTED
 
     def _set_interval(self, command: Command, link: Link) -> Result:

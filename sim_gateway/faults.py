@@ -95,7 +95,7 @@ KINDS: dict[str, Kind] = {
     "px4_failsafe": _kind(INCIDENT, "PX4's own failsafe changes the mode", once=True, main=4.0, sub=5.0),
     "refuse_offboard": _kind(INCIDENT, "PX4 refuses OFFBOARD"),
     "reboot": _kind(INCIDENT, "the autopilot restarts: motors off, its boot time begins anew", once=True),
-    "battery": _kind(INCIDENT, "the battery is down to a fraction", once=True, fraction=0.1),
+    "battery": _kind(INCIDENT, "the battery is down to a fraction (`slowly`=1: shown late)", once=True, fraction=0.1, slowly=0.0),
     "rogue": _kind(INCIDENT, "another program sends velocity setpoints", x_m_s=0.5, y_m_s=0.0, rate_hz=20.0),
     "rogue_mode": _kind(INCIDENT, "another program changes the mode", once=True, main=4.0, sub=6.0),
 }

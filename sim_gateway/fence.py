@@ -1,7 +1,6 @@
-"""The MAVLink mission protocol for geofence items: upload, download, clear, as PX4 answers it (geofence.json).
+"""The MAVLink mission protocol for fences and missions: upload, download, clear, as PX4 answers it (geofence.json).
 
-Only `mission_type` FENCE is stored; missions and rally points stay unsupported. The stored fence is not enforced by the gateway:
-it is there so that a client's upload can be checked and read back.
+`geofence_monitor` watches a stored fence, `mission` flies a stored mission.
 """
 
 from __future__ import annotations
@@ -12,41 +11,57 @@ from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import development as mav
 
+from sim_gateway.geofence_monitor import Circle, Polygon, Shape
+from sim_gateway.local_frame import LocalFrame
+from sim_gateway.mission import Leg
 from sim_gateway.telemetry import Message
 
-FENCE = mav.MAV_MISSION_TYPE_FENCE
+FENCE, MISSION = mav.MAV_MISSION_TYPE_FENCE, mav.MAV_MISSION_TYPE_MISSION
 MAX_ITEMS = 100
 REQUEST_AGAIN_S, GIVE_UP_S = 0.25, 5.0
 _COMMANDS = range(mav.MAV_CMD_NAV_FENCE_RETURN_POINT, mav.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION + 1)
+_VERTICES = (mav.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION, mav.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
+_CIRCLES = (mav.MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION, mav.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION)
+_INCLUSIONS = (_VERTICES[0], _CIRCLES[0])
+_RELATIVE_FRAMES = (3, 6)
 _FRAMES = (0, 5, 3, 6)  # MAV_FRAME_GLOBAL and GLOBAL_RELATIVE_ALT, as float and as scaled integers
 _SCALED_LIMITS = (900_000_000, 1_800_000_000)  # latitude and longitude, 1e-7 degrees
 
 
 @dataclass(frozen=True, slots=True)
-class FenceItem:
-    """One vertex or circle. `params`: 1 to 4 of the item; latitude and longitude in 1e-7 degrees."""
+class Item:
+    """One vertex, circle or mission item. `params`: 1 to 4 of it; latitude and longitude in 1e-7 degrees."""
 
     command: int
     frame: int
     params: tuple[float, float, float, float]
     latitude_e7: int
     longitude_e7: int
+    altitude_m: float = 0.0
 
 
 @dataclass(slots=True)
 class _Upload:
     partner: tuple[int, int]
     count: int
-    items: list[FenceItem]
+    items: list[Item]
     asked_s: float
     heard_s: float
 
 
-class FenceStore:
-    """The fence of one vehicle, and the protocol around it. `uploads`, `downloads`, `clears`: completed ones."""
+class ItemStore:
+    """The fence or the mission of one vehicle, and the protocol around it. `uploads`, `downloads`, `clears`: completed ones."""
 
-    def __init__(self, now_s: Callable[[], float]) -> None:
-        self.items: tuple[FenceItem, ...] = ()
+    def __init__(
+        self,
+        now_s: Callable[[], float],
+        changed: Callable[[tuple[Item, ...]], None] = lambda _: None,
+        mission_type: int = FENCE,
+    ) -> None:
+        """`changed` is called with everything that is stored, whenever that changes."""
+        self.mission_type = mission_type
+        self._changed = changed
+        self.items: tuple[Item, ...] = ()
         self.uploads = self.downloads = self.clears = 0
         self._now_s = now_s
         self._upload: _Upload | None = None
@@ -55,7 +70,7 @@ class FenceStore:
         """MISSION_COUNT: an upload begins (0 items: clears), each item is asked for in turn."""
         partner = _sender(message)
         if message.count > MAX_ITEMS:
-            send(_ack(partner, mav.MAV_MISSION_NO_SPACE))
+            send(self._ack(partner, mav.MAV_MISSION_NO_SPACE))
             return
         if message.count == 0:
             self.on_clear(message, send)
@@ -68,41 +83,42 @@ class FenceStore:
         """MISSION_ITEM_INT of an upload: the expected one is kept, another one makes it ask again."""
         upload, partner = self._upload, _sender(message)
         if upload is None or upload.partner != partner:
-            send(_ack(partner, mav.MAV_MISSION_INVALID_SEQUENCE if upload is None else mav.MAV_MISSION_DENIED))
+            send(self._ack(partner, mav.MAV_MISSION_INVALID_SEQUENCE if upload is None else mav.MAV_MISSION_DENIED))
             return
         upload.heard_s = self._now_s()
         if message.seq != len(upload.items):
             self._ask(send)
             return
-        problem = _item_problem(message)
+        problem = _fence_problem(message) if self.mission_type == FENCE else _mission_problem(message)
         if problem is not None:
             self._upload = None
-            send(_ack(partner, problem))
+            send(self._ack(partner, problem))
             return
         params = (message.param1, message.param2, message.param3, message.param4)
-        upload.items.append(FenceItem(message.command, message.frame, params, message.x, message.y))
+        upload.items.append(Item(message.command, message.frame, params, message.x, message.y, message.z))
         if len(upload.items) < upload.count:
             self._ask(send)
             return
         self.items, self._upload = tuple(upload.items), None
         self.uploads += 1
-        send(_ack(partner, mav.MAV_MISSION_ACCEPTED))
+        self._changed(self.items)
+        send(self._ack(partner, mav.MAV_MISSION_ACCEPTED))
 
     def on_list(self, message: Message, send: Callable[[Message], None]) -> None:
         """MISSION_REQUEST_LIST: how many items there are."""
-        send(mav.MAVLink_mission_count_message(*_sender(message), len(self.items), FENCE))
+        send(mav.MAVLink_mission_count_message(*_sender(message), len(self.items), self.mission_type))
 
     def on_request(self, message: Message, send: Callable[[Message], None]) -> None:
         """MISSION_REQUEST_INT: one item of a download."""
         partner = _sender(message)
         if message.seq >= len(self.items):
-            send(_ack(partner, mav.MAV_MISSION_INVALID_SEQUENCE))
+            send(self._ack(partner, mav.MAV_MISSION_INVALID_SEQUENCE))
             return
         item = self.items[message.seq]
-        place = (item.latitude_e7, item.longitude_e7, 0.0)
+        place = (item.latitude_e7, item.longitude_e7, item.altitude_m)
         send(
             mav.MAVLink_mission_item_int_message(
-                *partner, message.seq, item.frame, item.command, 0, 1, *item.params, *place, FENCE
+                *partner, message.seq, item.frame, item.command, 0, 1, *item.params, *place, self.mission_type
             )
         )
 
@@ -114,7 +130,8 @@ class FenceStore:
         """MISSION_CLEAR_ALL: nothing is left."""
         self.items, self._upload = (), None
         self.clears += 1
-        send(_ack(_sender(message), mav.MAV_MISSION_ACCEPTED))
+        self._changed(())
+        send(self._ack(_sender(message), mav.MAV_MISSION_ACCEPTED))
 
     def poll(self, send: Callable[[Message], None]) -> None:
         """Ask again for an item that does not come; give an upload up that has fallen silent."""
@@ -124,18 +141,63 @@ class FenceStore:
         now_s = self._now_s()
         if now_s - upload.heard_s > GIVE_UP_S:
             self._upload = None
-            send(_ack(upload.partner, mav.MAV_MISSION_OPERATION_CANCELLED))
+            send(self._ack(upload.partner, mav.MAV_MISSION_OPERATION_CANCELLED))
         elif now_s - upload.asked_s > REQUEST_AGAIN_S:
             self._ask(send)
+
+    def _ack(self, partner: tuple[int, int], result: int) -> Message:
+        return mav.MAVLink_mission_ack_message(*partner, result, self.mission_type)
 
     def _ask(self, send: Callable[[Message], None]) -> None:
         upload = self._upload
         if upload is not None:
             upload.asked_s = self._now_s()
-            send(mav.MAVLink_mission_request_int_message(*upload.partner, len(upload.items), FENCE))
+            send(mav.MAVLink_mission_request_int_message(*upload.partner, len(upload.items), self.mission_type))
 
 
-def _item_problem(message: Message) -> int | None:
+def shapes(items: tuple[Item, ...], frame: LocalFrame) -> list[Shape]:
+    """The items in local coordinates: a polygon is as many vertices in a row as the first one's parameter 1 says."""
+    found: list[Shape] = []
+    rest = list(items)
+    while rest:
+        item, count = rest[0], 1
+        inclusion = item.command in _INCLUSIONS
+        corners = [_place(vertex, frame) for vertex in rest]
+        if item.command in _CIRCLES:
+            found.append(Circle(inclusion, corners[0], item.params[0]))
+        elif item.command in _VERTICES:
+            count = max(int(item.params[0]), 1)
+            found.append(Polygon(inclusion, tuple(corners[:count])))
+        del rest[:count]
+    return found
+
+
+def _place(item: Item, frame: LocalFrame) -> tuple[float, float]:
+    north, east, _ = frame.from_global(item.latitude_e7 * 1e-7, item.longitude_e7 * 1e-7, 0.0)
+    return north, east
+
+
+def legs(items: tuple[Item, ...], frame: LocalFrame) -> tuple[Leg, ...]:
+    """Mission items in local coordinates; without a place of their own they are where the vehicle is."""
+    found = []
+    for item in items:
+        nowhere = item.frame == mav.MAV_FRAME_MISSION or (item.latitude_e7, item.longitude_e7) == (0, 0)
+        north, east = (math.nan, math.nan) if nowhere else _place(item, frame)
+        above_home = item.frame in _RELATIVE_FRAMES
+        altitude = item.altitude_m if above_home else item.altitude_m - frame.altitude_m
+        found.append(Leg(item.command, north, east, altitude, above_home, item.params))
+    return tuple(found)
+
+
+def _mission_problem(message: Message) -> int | None:
+    if message.frame not in (*_FRAMES, mav.MAV_FRAME_MISSION):
+        return int(mav.MAV_MISSION_UNSUPPORTED_FRAME)
+    if abs(message.x) > _SCALED_LIMITS[0] or abs(message.y) > _SCALED_LIMITS[1] or not math.isfinite(message.z):
+        return int(mav.MAV_MISSION_INVALID)
+    return None
+
+
+def _fence_problem(message: Message) -> int | None:
     """MAV_MISSION_RESULT of an item that cannot be stored, or None."""
     if message.command not in _COMMANDS:
         return int(mav.MAV_MISSION_UNSUPPORTED)
@@ -148,7 +210,3 @@ def _item_problem(message: Message) -> int | None:
 
 def _sender(message: Message) -> tuple[int, int]:
     return int(message.get_srcSystem()), int(message.get_srcComponent())
-
-
-def _ack(partner: tuple[int, int], result: int) -> Message:
-    return mav.MAVLink_mission_ack_message(*partner, result, FENCE)

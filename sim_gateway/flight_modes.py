@@ -9,6 +9,8 @@ from __future__ import annotations
 from enum import Enum, IntEnum
 
 AUTO_MAIN_MODE = 4
+# MAV_SEVERITY
+EMERGENCY, CRITICAL, ERROR, WARNING, INFO = 0, 2, 3, 4, 6
 
 # MAV_MODE_FLAG bits of HEARTBEAT.base_mode
 _CUSTOM, _AUTO, _GUIDED, _STABILIZE, _MANUAL, _ARMED = 1, 4, 8, 16, 64, 128

@@ -13,12 +13,15 @@ from typing import Protocol
 from sim_gateway.local_frame import NedState, Vector, wrap_pi
 from sim_gateway.parameters import ParameterStore
 from sim_gateway.setpoints import NAN, NOTHING, OffboardSetpoint
-from sim_gateway.sticks import Sticks
+from sim_gateway.sticks import Sticks, shaped
 
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _STOPPED_M_S = 0.15
 _BRAKE_TIMEOUT_S = 3.0
 _DESCEND_M_S = 0.8
+_STICK_EXPO = 0.6  # PX4 default of MPC_XY_MAN_EXPO, which the recorded build does not list
+_TAKEOFF_GAIN = 0.6  # 1/s; recorded climbs slow down like this towards their altitude
+_TAKEOFF_AT_LEAST_S = 1.5  # recorded: a takeoff in the air is over after about two seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +152,11 @@ class TakeoffTask:
         """Setpoint of the climb."""
         get = self.parameters.get
         north, east = self._motion.horizontal_to(state, self.target, get("MPC_XY_CRUISE"))
-        down = self._motion.vertical_to(state, self.target_down_m, get("MPC_TKO_SPEED"), get("MPC_Z_V_AUTO_DN"))
+        up_m_s = min(get("MPC_TKO_SPEED"), _TAKEOFF_GAIN * max(state.position[2] - self.target_down_m, 0.0))
+        down = self._motion.vertical_to(state, self.target_down_m, up_m_s, get("MPC_Z_V_AUTO_DN"))
         velocity = self._motion.towards((north, east, down), dt_s)
-        self.finished = abs(self.target_down_m - state.position[2]) < get("NAV_MC_ALT_RAD")
+        there = abs(self.target_down_m - state.position[2]) < get("NAV_MC_ALT_RAD")
+        self.finished = there and state.time_s - self.state_at_entry.time_s > _TAKEOFF_AT_LEAST_S
         yaw = self.state_at_entry.yaw_rad
         target = OffboardSetpoint(self.target, velocity, NOTHING, yaw, 0.0)
         return MotionCommand(velocity, yaw_rate_towards(yaw, state, self.parameters), target)
@@ -325,8 +330,9 @@ class PositionTask:
         get, sticks = self.parameters.get, self.sticks
         cos, sin = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
         full = get("MPC_VEL_MANUAL")
-        north = full * (cos * sticks.ahead - sin * sticks.right)
-        east = full * (sin * sticks.ahead + cos * sticks.right)
+        ahead, right = (shaped(axis, get("MAN_DEADZONE"), _STICK_EXPO) for axis in (sticks.ahead, sticks.right))
+        north = full * (cos * ahead - sin * right)
+        east = full * (sin * ahead + cos * right)
         down = -sticks.up * get("MPC_Z_VEL_MAX_UP" if sticks.up > 0.0 else "MPC_Z_VEL_MAX_DN")
         velocity = self._motion.towards(limit_velocity((north, east, down), self.parameters), dt_s)
         yaw_rate = math.radians(get("MPC_MAN_Y_MAX")) * sticks.turn

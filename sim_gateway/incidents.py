@@ -33,7 +33,7 @@ class Incidents:
             "pilot_mode": self._once(self._pilot_mode),
             "pilot_sticks": self._pilot_sticks,
             "disarm": self._once(lambda _: self._pilot.disarm(force=True)),
-            "px4_failsafe": self._once(lambda item: self._pilot.fail_into(_mode(item))),
+            "px4_failsafe": self._once(lambda item: self._pilot.failsafes.fail_into(_mode(item))),
             "reboot": self._once(self._reboot),
             "battery": self._once(self._drain),
             "rogue": self._rogue_setpoint,
@@ -92,7 +92,7 @@ class Incidents:
         self._pilot.restart()
 
     def _drain(self, item: Active) -> None:
-        self._pilot.battery.fraction = item["fraction"]
+        self._pilot.battery.fail(item["fraction"], shown_at_once=item["slowly"] == 0.0)
 
     def _rogue_setpoint(self, item: Active, now_s: float) -> None:
         if not self._is_due(item, now_s, 1.0 / item["rate_hz"]):

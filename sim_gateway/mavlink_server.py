@@ -11,10 +11,10 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import development as mav
 
-from sim_gateway.autopilot import CRITICAL, Autopilot
+from sim_gateway.autopilot import Autopilot
 from sim_gateway.commands import Command, CommandHandler
-from sim_gateway.fence import FENCE, FenceStore
-from sim_gateway.flight_modes import FlightMode, Result
+from sim_gateway.fence import FENCE, MISSION, ItemStore, legs, shapes
+from sim_gateway.flight_modes import CRITICAL, FlightMode, Result
 from sim_gateway.local_frame import LocalFrame
 from sim_gateway.log_server import LogServer
 from sim_gateway.mavlink_links import MavlinkLink, PortInUseError, UdpLink
@@ -53,7 +53,9 @@ class MavlinkServer:
         self.links = links if links is not None else self._udp_links(onboard_ports, ground_ports)
         self._shown_mode: tuple[FlightMode, FlightMode] | None = None
         self._shown_landed = -1
-        self.fence = FenceStore(self._now)
+        self.fence = ItemStore(self._now, lambda items: autopilot.failsafes.geofence.set_shapes(shapes(items, frame)))
+        self.mission = ItemStore(self._now, lambda items: autopilot.mission.replace(legs(items, frame)), MISSION)
+        self._stores = {FENCE: self.fence, MISSION: self.mission}
         self.vehicle_log = VehicleLog(autopilot)
         self._log_server = LogServer(self.vehicle_log)
         self.wire_log = WireLog(self._now)
@@ -70,9 +72,10 @@ class MavlinkServer:
             "MISSION_REQUEST_LIST": self._on_mission_list,
             "MISSION_COUNT": self._on_mission_count,
             "MISSION_CLEAR_ALL": self._on_mission_clear,
-            "MISSION_ITEM_INT": self._on_fence_message(self.fence.on_item),
-            "MISSION_REQUEST_INT": self._on_fence_message(self.fence.on_request),
-            "MISSION_ACK": self._on_fence_message(self.fence.on_ack),
+            "MISSION_SET_CURRENT": self._on_mission_set_current,
+            "MISSION_ITEM_INT": self._for_store(ItemStore.on_item),
+            "MISSION_REQUEST_INT": self._for_store(ItemStore.on_request),
+            "MISSION_ACK": self._for_store(ItemStore.on_ack),
             "LOG_REQUEST_LIST": lambda m, link: self._log_server.on_list(m, link.send),
             "LOG_REQUEST_DATA": lambda m, link: self._log_server.on_data(m, link.send),
             "LOG_REQUEST_END": lambda m, link: self._log_server.on_end(m, link.send),
@@ -111,6 +114,7 @@ class MavlinkServer:
         self._log_server.poll()
         for link in self.links:
             self.fence.poll(link.send)
+            self.mission.poll(link.send)
             for name in link.due(self._telemetry.available):
                 link.send(self._telemetry.build(name))
             for _ in range(min(_PARAMS_PER_POLL, len(link.parameter_queue))):
@@ -126,6 +130,10 @@ class MavlinkServer:
             for link in self.links:
                 if link.has_gcs:
                     link.send_text(text)
+        while pilot.mission.reached:
+            number = pilot.mission.reached.popleft()
+            for link in self.links:
+                link.send(mav.MAVLink_mission_item_reached_message(number))
         mode, landed = (pilot.mode, pilot.intended), int(pilot.landed_state)
         for name, changed in (("CURRENT_MODE", mode != self._shown_mode), ("EXTENDED_SYS_STATE", landed != self._shown_landed)):
             if changed and self._telemetry.available(name):
@@ -156,7 +164,8 @@ class MavlinkServer:
     # ---- commands
 
     def _run(self, command: Command, message: Message, link: MavlinkLink) -> None:
-        sender = (message.get_srcSystem(), message.get_srcComponent())
+        injected = command.number == mav.MAV_CMD_INJECT_FAILURE  # PX4's simulator answers to everybody
+        sender = (0, 0) if injected else (message.get_srcSystem(), message.get_srcComponent())
 
         def acknowledge(result: Result) -> None:
             link.send(mav.MAVLink_command_ack_message(command.number, int(result), 0, 0, *sender))
@@ -245,37 +254,42 @@ class MavlinkServer:
             for other in (link, *(x for x in self.links if x is not link)):
                 self._send_parameter(name, other)
 
-    # ---- a fence is stored; missions are not flown: a client that asks gets an empty list
+    # ---- fence and mission; rally points: a client that asks gets an empty list
 
-    @staticmethod
-    def _on_fence_message(
-        handler: Callable[[Message, Callable[[Message], None]], None],
+    def _for_store(
+        self, handler: Callable[[ItemStore, Message, Callable[[Message], None]], None]
     ) -> Callable[[Message, MavlinkLink], None]:
         def handle(m: Message, link: MavlinkLink) -> None:
-            if m.mission_type == FENCE:
-                handler(m, link.send)
+            if m.mission_type in self._stores:
+                handler(self._stores[m.mission_type], m, link.send)
 
         return handle
 
     def _on_mission_list(self, m: Message, link: MavlinkLink) -> None:
-        if m.mission_type == FENCE:
-            self.fence.on_list(m, link.send)
+        if m.mission_type in self._stores:
+            self._stores[m.mission_type].on_list(m, link.send)
             return
         link.send(mav.MAVLink_mission_count_message(m.get_srcSystem(), m.get_srcComponent(), 0, m.mission_type))
 
     def _on_mission_count(self, m: Message, link: MavlinkLink) -> None:
-        if m.mission_type == FENCE:
-            self.fence.on_count(m, link.send)
+        if m.mission_type in self._stores:
+            self._stores[m.mission_type].on_count(m, link.send)
             return
         result = mav.MAV_MISSION_ACCEPTED if m.count == 0 else mav.MAV_MISSION_UNSUPPORTED
         link.send(mav.MAVLink_mission_ack_message(m.get_srcSystem(), m.get_srcComponent(), result, m.mission_type))
 
     def _on_mission_clear(self, m: Message, link: MavlinkLink) -> None:
-        if m.mission_type == FENCE:
-            self.fence.on_clear(m, link.send)
-            return
-        ack = mav.MAV_MISSION_ACCEPTED
-        link.send(mav.MAVLink_mission_ack_message(m.get_srcSystem(), m.get_srcComponent(), ack, m.mission_type))
+        for kind, store in self._stores.items():
+            if m.mission_type in (kind, mav.MAV_MISSION_TYPE_ALL):
+                store.on_clear(m, link.send)
+        if m.mission_type == mav.MAV_MISSION_TYPE_RALLY:
+            ack = mav.MAV_MISSION_ACCEPTED
+            link.send(mav.MAVLink_mission_ack_message(m.get_srcSystem(), m.get_srcComponent(), ack, m.mission_type))
+
+    def _on_mission_set_current(self, m: Message, _: MavlinkLink) -> None:
+        if self._autopilot.mission.set_current(m.seq):
+            for link in self.links:
+                link.send(self._telemetry.build("MISSION_CURRENT"))
 
     # ---- time
 

@@ -69,8 +69,6 @@ def read_setpoint(
     """
     if frame not in (FRAME_LOCAL_NED, FRAME_BODY_NED):
         raise SetpointRefusedError(f"{message} coordinate frame {frame} unsupported")
-    if type_mask & FORCE:
-        raise SetpointRefusedError(f"{message} force not supported")
     position, velocity = _masked(position, type_mask, _X), _masked(velocity, type_mask, _VX)
     acceleration = _masked(acceleration, type_mask, _AX)
     if frame == FRAME_BODY_NED:
@@ -78,5 +76,7 @@ def read_setpoint(
         acceleration = _turned(acceleration, vehicle_yaw_rad)
     if not (_any_finite(position) or _any_finite(velocity) or _any_finite(acceleration)):
         raise SetpointRefusedError(f"{message} invalid")
+    if type_mask & FORCE:
+        raise SetpointRefusedError(f"{message} force not supported")
     yaw = NAN if type_mask & YAW_IGNORE else yaw_rad
     return OffboardSetpoint(position, velocity, acceleration, yaw, NAN if type_mask & YAW_RATE_IGNORE else yaw_rate_rad_s)

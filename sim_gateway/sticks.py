@@ -41,3 +41,9 @@ def moved(before: Sticks, after: Sticks, threshold_per_s: float) -> bool:
         return False
     interval_s = max(after.time_s - before.time_s, MIN_INTERVAL_S)
     return any(abs(b - a) / interval_s > threshold_per_s for a, b in zip(before.axes, after.axes, strict=True))
+
+
+def shaped(axis: float, dead_zone: float, expo: float) -> float:
+    """A stick as PX4's position mode takes it: nothing inside the dead zone, then a mix of straight and cubic."""
+    beyond = max(abs(axis) - dead_zone, 0.0) / max(1.0 - dead_zone, 1e-3)
+    return math.copysign((1.0 - expo) * beyond + expo * beyond**3, axis)

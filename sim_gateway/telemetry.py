@@ -14,8 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 from pymavlink.dialects.v20 import development as mav
 
+from sim_gateway import census_messages as more
 from sim_gateway.autopilot import Autopilot
+from sim_gateway.flight_modes import FlightMode
 from sim_gateway.local_frame import LocalFrame, Vector
+from sim_gateway.newer_messages import NEWER_IDS
 from sim_gateway.obstacle_distance import obstacle_distance
 from sim_gateway.setpoints import OffboardSetpoint
 from sim_gateway.simulation import Scan
@@ -59,6 +62,7 @@ STREAM_RATES_HZ: dict[str, tuple[float, float]] = {
     "TIMESYNC": (10, 0),
     "VFR_HUD": (10, 4),
     "VIBRATION": (0.5, 0.1),
+    **more.RATES_HZ,
 }
 ONBOARD, GROUND = 0, 1  # column of STREAM_RATES_HZ
 _FROM_S = {
@@ -73,7 +77,8 @@ _FROM_S = {
 _SENSORS = 0x1 | 0x2 | 0x4 | 0x8  # gyro, accelerometer, magnetometer, barometer
 _CONTROLS = 0x400 | 0x800 | 0x1000 | 0x2000 | 0x4000 | 0x8000
 _GPS, _AHRS, _BATTERY, _PREARM = 0x20, 0x200000, 0x2000000, 0x10000000
-_NO_POSITION_FLAGS = 2 | 8 | 16  # of ESTIMATOR_STATUS: horizontal velocity, relative and absolute position
+_POSITION_FLAGS = 2 | 8 | 16  # of ESTIMATOR_STATUS: horizontal velocity, relative and absolute position
+_TERRAIN_FLAG, _PREDICTED_FLAGS = 64, 256 | 512
 _MAGNETIC_FIELD_NED_GAUSS: Vector = (0.212, 0.009, 0.427)  # at PX4's default place
 _EPOCH_US = int(time.time() * 1e6)
 
@@ -135,7 +140,7 @@ class Telemetry:
         self._builders: dict[str, Callable[[Snapshot], Message]] = {
             name: getattr(self, f"_{name.lower()}") for name in (*STREAM_RATES_HZ, "AUTOPILOT_VERSION")
         }
-        self._names = {getattr(mav, f"MAVLINK_MSG_ID_{name}"): name for name in self._builders}
+        self._names = {getattr(mav, f"MAVLINK_MSG_ID_{name}", NEWER_IDS.get(name)): name for name in self._builders}
 
     def name_of(self, message_id: int) -> str | None:
         """The message's name if this vehicle can send it."""
@@ -144,6 +149,8 @@ class Telemetry:
     def available(self, name: str) -> bool:
         """Whether start-up has come far enough for this message, and what it tells of is there."""
         if name in self.silent or (name == "OBSTACLE_DISTANCE" and self.scan is None):
+            return False
+        if name == "POSITION_TARGET_GLOBAL_INT" and not all(map(math.isfinite, self._autopilot.target.position)):
             return False
         if self.faults is not None and self.faults.silences(name, self.now_s()):
             return False
@@ -202,8 +209,11 @@ class Telemetry:
         return mav.MAVLink_battery_status_message(0, 0, 0, 32767, cells, 0, 0, -1, battery.percent, 0, battery.charge_state)
 
     def _estimator_status(self, now: Snapshot) -> Message:
+        failsafes = self._autopilot.failsafes
         flags = 0x33F if now.time_s >= POSITION_FLAG_FROM_S else 0x27
-        flags &= ~_NO_POSITION_FLAGS if self._autopilot.position_given_up else ~0
+        flags |= _TERRAIN_FLAG if not self._autopilot.landed else 0
+        flags &= ~_POSITION_FLAGS if failsafes.position_given_up else ~0
+        flags &= ~_PREDICTED_FLAGS if failsafes.prediction_given_up else ~0
         return mav.MAVLink_estimator_status_message(self._usec(now), flags, 0.1, 0.1, 0.1, 0.1, 0.0, 0.0, 0.3, 0.4)
 
     def _autopilot_version(self, _: Snapshot) -> Message:
@@ -211,7 +221,16 @@ class Telemetry:
         return mav.MAVLink_autopilot_version_message(59647, 17891328, 17891328, 0, 1, zeros, zeros, zeros, 0, 0, SYSTEM_ID)
 
     def _mission_current(self, _: Snapshot) -> Message:
-        return mav.MAVLink_mission_current_message(0, 0, mav.MISSION_STATE_NO_MISSION, 0)
+        mission, flying = self._autopilot.mission, self._autopilot.mode is FlightMode.MISSION
+        state = mav.MISSION_STATE_NO_MISSION if not mission.legs else mav.MISSION_STATE_NOT_STARTED
+        if mission.complete:
+            state = mav.MISSION_STATE_COMPLETE
+        elif flying and mission.legs:
+            state = mav.MISSION_STATE_ACTIVE
+        elif mission.current:
+            state = mav.MISSION_STATE_PAUSED
+        number = min(mission.current, max(len(mission.legs) - 1, 0))
+        return mav.MAVLink_mission_current_message(number, len(mission.legs), state, 1 if flying else 2 if mission.legs else 0)
 
     # ---- time
 
@@ -282,6 +301,7 @@ class Telemetry:
     def _position_target_local_ned(self, now: Snapshot) -> Message:
         target: OffboardSetpoint = self._autopilot.target
         type_mask = 0 if math.isfinite(target.position[2]) else 7
+        type_mask |= 0 if any(math.isfinite(value) for value in target.velocity) else 56
         return mav.MAVLink_position_target_local_ned_message(
             self._msec(now),
             mav.MAV_FRAME_LOCAL_NED,
@@ -322,7 +342,9 @@ class Telemetry:
         speed = math.hypot(now.velocity[0], now.velocity[1])
         course = round(_heading_deg(math.atan2(now.velocity[1], now.velocity[0])) * 100) % 36000
         place = (round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3))
-        fix, satellites = (3, 16) if self._autopilot.gps_fix else (0, 0)
+        fix, satellites = (
+            (3, int(self._autopilot.parameters.get("SIM_GPS_USED"))) if self._autopilot.failsafes.gps_fix else (0, 0)
+        )
         return mav.MAVLink_gps_raw_int_message(
             self._usec(now), fix, *place, 90, 90, _clamp_int(speed * 100, 0, 65534), course, satellites, place[2], 900, 1780, 250
         )
@@ -360,3 +382,26 @@ class Telemetry:
 
     def _vibration(self, now: Snapshot) -> Message:
         return mav.MAVLink_vibration_message(self._usec(now), 0.0, 0.0, 0.0, 0, 0, 0)
+
+    # ---- beside the flight data
+
+    def _current_event_sequence(self, _: Snapshot) -> Message:
+        return more.current_event_sequence()
+
+    def _link_node_status(self, now: Snapshot) -> Message:
+        return more.link_node_status(self._usec(now))
+
+    def _time_estimate_to_target(self, _: Snapshot) -> Message:
+        return more.time_estimate_to_target()
+
+    def _gnss_integrity(self, _: Snapshot) -> Message:
+        return more.gnss_integrity()
+
+    def _open_drone_id_location(self, now: Snapshot) -> Message:
+        return more.open_drone_id_location(self._autopilot, self._frame, now.position, now.velocity)
+
+    def _open_drone_id_system(self, _: Snapshot) -> Message:
+        return more.open_drone_id_system(self._autopilot, self._frame)
+
+    def _position_target_global_int(self, now: Snapshot) -> Message:
+        return more.position_target_global_int(self._msec(now), self._autopilot, self._frame)

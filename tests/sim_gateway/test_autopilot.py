@@ -309,7 +309,7 @@ def test_disarming_in_the_air_needs_force() -> None:
 def test_armed_and_idle_on_the_ground_disarms_itself() -> None:
     card = Card()
     card.pilot.arm()
-    assert card.until(lambda: not card.pilot.armed, 12.0) == pytest.approx(10.0, abs=0.1)  # COM_DISARM_PRFLT
+    assert card.until(lambda: not card.pilot.armed, 12.0) == pytest.approx(11.0, abs=0.1)  # COM_SPOOLUP_TIME and COM_DISARM_PRFLT
     assert card.ned == pytest.approx((0.0, 0.0, 0.0))
 
 

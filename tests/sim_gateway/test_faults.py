@@ -377,4 +377,4 @@ def test_inject_failure_needs_its_parameter_and_answers_as_recorded() -> None:
     assert inject(rig, 4, 0) == [0]
     assert rig.pilot.gps_fix
     assert inject(rig, 100, 1) == [0]
-    assert rig.pilot.battery.percent == 4
+    assert rig.run(5.0).pilot.battery.percent == 0

@@ -20,6 +20,7 @@ from sim_gateway.autopilot import StatusText
 from sim_gateway.flight_modes import FlightMode, Result
 from sim_gateway.mavlink_links import PortInUseError
 from sim_gateway.mavlink_server import MavlinkServer
+from sim_gateway.newer_messages import NEWER_IDS
 from sim_gateway.telemetry import GROUND, ONBOARD, STREAM_RATES_HZ, Telemetry
 
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
@@ -41,7 +42,10 @@ def test_rates_are_those_of_the_recorded_links(bench: Bench) -> None:
     for client, column in ((bench.onboard, ONBOARD), (bench.ground, GROUND)):
         counts = Counter(message.get_type() for message in client.seen)
         for name, rates in STREAM_RATES_HZ.items():
-            assert counts.pop(name, 0) == pytest.approx(rates[column] * seconds, abs=1.01 + 0.01 * rates[column] * seconds), name
+            if name == "POSITION_TARGET_GLOBAL_INT":
+                continue  # only while there is a position target: see test_conformance
+            seen = f"UNKNOWN_{NEWER_IDS[name]}" if name in NEWER_IDS else name  # this client's library lacks them
+            assert counts.pop(seen, 0) == pytest.approx(rates[column] * seconds, abs=1.01 + 0.01 * rates[column] * seconds), name
         assert not counts
 
 

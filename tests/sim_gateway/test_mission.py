@@ -1,0 +1,100 @@
+"""Missions: uploaded, read back, flown item by item, paused, cleared."""
+
+from __future__ import annotations
+
+import math
+
+from pymavlink.dialects.v20 import development as mav
+
+from sim_gateway.conformance.bench import Bench
+from sim_gateway.flight_modes import FlightMode
+
+Item = tuple[int, float, float, float, tuple[float, ...]]
+NAN = math.nan
+FLIGHT: list[Item] = [
+    (mav.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 4.0, (0, 0, 0, NAN)),
+    (mav.MAV_CMD_DO_CHANGE_SPEED, 0.0, 0.0, 0.0, (1, 3.0, -1, 0)),
+    (mav.MAV_CMD_NAV_WAYPOINT, 12.0, 0.0, 4.0, (0, 1.0, 0, NAN)),
+    (mav.MAV_CMD_NAV_WAYPOINT, 12.0, 8.0, 5.0, (2.0, 1.0, 0, NAN)),
+    (mav.MAV_CMD_NAV_LAND, 12.0, 8.0, 0.0, (0, 0, 0, NAN)),
+]
+
+
+def upload(bench: Bench, items: list[Item]) -> int:
+    """Type of the acknowledgement."""
+    since_s = bench.time_s
+    bench.onboard.send(mav.MAVLink_mission_count_message(1, 1, len(items), 0))
+    for _ in range(len(items)):
+        asked = bench.run(0.04).named("MISSION_REQUEST_INT", since_s)[-1][1]
+        command, north, east, height, params = items[asked.seq]
+        latitude, longitude, _ = bench.vehicle.frame.to_global((north, east, 0.0))
+        place = (round(latitude * 1e7), round(longitude * 1e7), height)
+        message = mav.MAVLink_mission_item_int_message(1, 1, asked.seq, 6, command, 0, 1, *params, *place, 0)
+        bench.onboard.send(message)
+    return int(bench.run(0.1).named("MISSION_ACK", since_s)[-1][1].type)
+
+
+def start(bench: Bench) -> None:
+    bench.command(mav.MAV_CMD_DO_SET_MODE, 1, 4, 4).run(0.1)
+    bench.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1).run(0.1)
+
+
+def test_flies_takeoff_waypoints_and_landing() -> None:
+    bench = Bench()
+    assert upload(bench, FLIGHT) == mav.MAV_MISSION_ACCEPTED
+    start(bench)
+    assert bench.mode == "AUTO.MISSION"
+    corner = False
+    while bench.pilot.armed and bench.time_s < 90.0:
+        bench.run(0.2)
+        north, east, down = bench.pilot.state.position
+        corner = corner or math.dist((north, east, down), (12.0, 0.0, -4.0)) < 1.5
+    assert corner
+    assert not bench.pilot.armed
+    assert math.dist(bench.pilot.state.position[:2], (12.0, 8.0)) < 1.0
+    assert [m.seq for _, m in bench.named("MISSION_ITEM_REACHED")] == [0, 1, 2, 3]
+    assert bench.texts(0.0)[-1][2] == "Disarmed by landing"
+
+
+def test_reads_back_what_was_uploaded_and_clears_it() -> None:
+    bench = Bench()
+    upload(bench, FLIGHT)
+    bench.onboard.send(mav.MAVLink_mission_request_list_message(1, 1, 0))
+    assert bench.run(0.1).named("MISSION_COUNT")[-1][1].count == len(FLIGHT)
+    bench.onboard.send(mav.MAVLink_mission_request_int_message(1, 1, 3, 0))
+    item = bench.run(0.1).named("MISSION_ITEM_INT")[-1][1]
+    assert (item.command, item.z, item.param1, item.frame) == (mav.MAV_CMD_NAV_WAYPOINT, 5.0, 2.0, 6)
+    bench.onboard.send(mav.MAVLink_mission_clear_all_message(1, 1, 0))
+    assert bench.run(0.1).pilot.mission.legs == ()
+
+
+def test_hold_pauses_and_the_mission_goes_on_from_the_current_item() -> None:
+    bench = Bench()
+    upload(bench, FLIGHT[:3])
+    start(bench)
+    bench.run(30.0, until=lambda: bench.pilot.mission.current == 2)
+    bench.pilot.set_mode(FlightMode.LOITER)
+    bench.run(3.0)
+    state = bench.telemetry.build("MISSION_CURRENT")
+    assert (state.seq, state.total, state.mission_state) == (2, 3, mav.MISSION_STATE_PAUSED)
+    bench.pilot.set_mode(FlightMode.MISSION)
+    bench.run(30.0, until=lambda: bench.mode == "AUTO.LOITER")
+    assert bench.pilot.mission.complete
+    assert math.dist(bench.run(4.0).pilot.state.position[:2], (12.0, 0.0)) < 0.5
+
+
+def test_current_item_can_be_chosen() -> None:
+    bench = Bench(5.0)
+    upload(bench, FLIGHT)
+    bench.onboard.send(mav.MAVLink_mission_set_current_message(1, 1, 3))
+    assert bench.run(0.1).named("MISSION_CURRENT")[-1][1].seq == 3
+    bench.onboard.send(mav.MAVLink_mission_set_current_message(1, 1, 9))
+    assert bench.run(0.1).pilot.mission.current == 3
+    bench.command(mav.MAV_CMD_DO_SET_MISSION_CURRENT, 1).run(0.1)
+    assert bench.pilot.mission.current == 1
+
+
+def test_no_mission_in_the_air_is_refused() -> None:
+    bench = Bench(5.0)
+    bench.command(mav.MAV_CMD_MISSION_START).run(0.1)
+    assert bench.acks(mav.MAV_CMD_MISSION_START, 0.0) == ["TEMPORARILY_REJECTED"]
