@@ -41,6 +41,7 @@ class FreeSpace:
         self._spare = np.empty_like(self._seen_s)
         hull = config.vehicle_radius_m + config.position_error_m + config.velocity_error_m_s * config.delay_s + _sagitta_m(config)
         self._kernels = (_boxes(hull + CELL_M), _boxes(hull))
+        self._rim = int(self._kernels[0].max())
         self._hull = _disc(config.vehicle_radius_m)
         self._vicinity = _disc(hull + (1 + VICINITY_CELLS) * CELL_M)
         self.clear()
@@ -108,27 +109,58 @@ class FreeSpace:
         """
         boxes = self._kernels[0 if wide else 1]
         rim = int(boxes.max())
-        ix = np.floor(x_m / CELL_M).astype(np.intp) - self._corner[0]
-        iy = np.floor(y_m / CELL_M).astype(np.intp) - self._corner[1]
+        ix, iy = self._indices(x_m, 0), self._indices(y_m, 1)
         low_x, low_y = int(ix.min()) - rim, int(iy.min()) - rim
-        high_x, high_y = int(ix.max()) + rim + 1, int(iy.max()) + rim + 1
-        if min(low_x, low_y) < 0 or max(high_x, high_y) > SIDE_CELLS or self._began_s is None:
+        hidden = self._hidden(low_x, low_y, int(ix.max()) + rim + 1, int(iy.max()) + rim + 1, near_m, now_s)
+        if hidden is None:
             return np.full(x_m.shape, SIDE_CELLS * SIDE_CELLS, dtype=np.intp)
-        oldest_s = now_s - self._began_s - self._config.memory_s
-        hidden = self._seen_s[low_x:high_x, low_y:high_y] < oldest_s
         if not hidden.any():
             return np.zeros(x_m.shape, dtype=np.intp)
-        hidden &= ~self._surfaces(near_m, low_x, low_y, hidden.shape)
-        counts = _box_counts(hidden, boxes, rim)
-        result: Integers = counts[ix - (low_x + rim), iy - (low_y + rim)]
-        return result
+        counts: Integers = _box_counts(hidden, boxes, rim)[ix - (low_x + rim), iy - (low_y + rim)]
+        return counts
+
+    def all_seen_around(self, x_m: float, y_m: float, now_s: float) -> bool:
+        """Whether every cell that the hull could touch around a place was seen: quick, and False where it must be counted."""
+        i, j, rim = _cell(x_m) - self._corner[0], _cell(y_m) - self._corner[1], self._rim
+        if min(i, j) < rim or max(i, j) >= SIDE_CELLS - rim or self._began_s is None:
+            return False
+        around = self._seen_s[i - rim : i + rim + 1, j - rim : j + rim + 1]
+        return bool(around.min() >= now_s - self._began_s - self._config.memory_s)
+
+    def gap_m(self, x_m: Floats, y_m: Floats, near_m: Floats, now_s: float) -> Floats:
+        """Distance from places x, y [n] to the nearest unseen cell, m; what is further than the hull needs reads as that."""
+        rim = self._rim
+        ix, iy = self._indices(x_m, 0), self._indices(y_m, 1)
+        low_x, low_y = int(ix.min()) - rim, int(iy.min()) - rim
+        hidden = self._hidden(low_x, low_y, int(ix.max()) + rim + 1, int(iy.max()) + rim + 1, near_m, now_s)
+        if hidden is None:
+            return np.zeros(x_m.shape)
+        i, j = np.nonzero(hidden)
+        dx = np.abs(x_m[:, None] - CELL_M * (i + (low_x + self._corner[0] + 0.5))) - 0.5 * CELL_M
+        dy = np.abs(y_m[:, None] - CELL_M * (j + (low_y + self._corner[1] + 0.5))) - 0.5 * CELL_M
+        gaps: Floats = np.hypot(np.maximum(dx, 0.0), np.maximum(dy, 0.0)).min(axis=1, initial=rim * CELL_M)
+        return gaps
+
+    def _indices(self, places_m: Floats, axis: int) -> Integers:
+        cells: Integers = np.floor(places_m / CELL_M).astype(np.intp) - self._corner[axis]
+        return cells
+
+    def _hidden(self, low_x: int, low_y: int, high_x: int, high_y: int, near_m: Floats, now_s: float) -> Booleans | None:
+        """The unseen cells of a window of the map that belong to no known return; None for a window that is not on the map."""
+        if min(low_x, low_y) < 0 or max(high_x, high_y) > SIDE_CELLS or self._began_s is None:
+            return None
+        oldest_s = now_s - self._began_s - self._config.memory_s
+        hidden: Booleans = self._seen_s[low_x:high_x, low_y:high_y] < oldest_s
+        if near_m.shape[1] and hidden.any():
+            hidden &= ~self._surfaces(near_m, low_x, low_y, hidden.shape)
+        return hidden
 
     def _surfaces(self, near_m: Floats, low_x: int, low_y: int, shape: tuple[int, ...]) -> Booleans:
         """Cells of a window that belong to known returns."""
         border = SURFACE_CELLS
         mask = np.zeros((shape[0] + 2 * border, shape[1] + 2 * border), dtype=np.bool_)
-        ix = np.floor(near_m[0] / CELL_M).astype(np.intp) - (self._corner[0] + low_x - border)
-        iy = np.floor(near_m[1] / CELL_M).astype(np.intp) - (self._corner[1] + low_y - border)
+        ix = self._indices(near_m[0], 0) - (low_x - border)
+        iy = self._indices(near_m[1], 1) - (low_y - border)
         inside = (ix >= 0) & (iy >= 0) & (ix < mask.shape[0]) & (iy < mask.shape[1])
         mask[ix[inside], iy[inside]] = True
         rows = mask[: shape[0]].copy()

@@ -142,8 +142,7 @@ class Shield:
         if not allowed.permits(first[:1], clear[:1], fence[:1])[0]:
             found.extend(_reasons(allowed, first[0], clear[0], fence[0]))
             return False, bounds
-        seen = self._sight.permitted(bounds.hidden, tube, hidden, allowed.brake_stop_m, around.view)
-        if not seen[0]:
+        if not bounds.hidden.permits(hidden)[0]:
             found.append(Intervention("unseen", float(hidden.wide[0]), float(hidden.wide[1])))
             return False, bounds
         return True, bounds
@@ -151,14 +150,13 @@ class Shield:
     def _held_in(self, wanted: Floats, around: Surroundings, near: NearFence, allowed: Allowance) -> Floats:
         """All candidates [c, 3], turned along the fence, neither climbing nor sinking out of it."""
         brake = tubes(around.start, np.zeros((1, 3)), self._config)
-        candidates = held_in(
-            self._candidates(wanted, around, allowed), self._guard.ways_out(brake, near), allowed.push_m_s, self._config
-        )
+        ways = self._guard.ways_out(brake, near)
+        candidates = held_in(self._candidates(wanted, around, allowed), ways, allowed.push_m_s, self._config)
         candidates[:, 2] = np.clip(candidates[:, 2], allowed.sink_m_s, allowed.climb_m_s)
         return candidates
 
     def _nearest(self, wanted: Floats, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Floats:
-        """Of the candidates [c, 3] that pass, the one nearest to the wanted vector [3]; when none passes, horizontally none."""
+        """Of the candidates [c, 3] that pass, the one nearest to the wanted vector [3]; when none does, only what is due."""
         away = candidates - wanted
         candidates = candidates[np.argsort(np.einsum("ci,ci->c", away, away), kind="stable")]
         for few in (candidates[:FIRST_LOOK], candidates[FIRST_LOOK:]):
@@ -166,7 +164,15 @@ class Shield:
             if passed.shape[0]:
                 nearest: Floats = few[passed[0]]
                 return nearest
-        return bounds.allowed.hover_m_s
+        return self._due(around, near, bounds.allowed)
+
+    def _due(self, around: Surroundings, near: NearFence, allowed: Allowance) -> Floats:
+        """The way out of a margin [3], even into the unseen, since what presses is known; else no horizontal command."""
+        way = allowed.hover_m_s
+        way[:2] = allowed.push_m_s
+        tube = tubes(around.start, way[None], self._config)
+        clear, rooms = self._tube_clearances(tube, around), self._guard.rooms_m(tube, around.start, near)
+        return way if allowed.permits(way[None], clear, rooms)[0] else allowed.hover_m_s
 
     def _passing(self, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Integers:
         """Indices of the candidates [c, 3] that keep to the bounds; unseen space is counted only for those that pass all else."""
@@ -175,9 +181,7 @@ class Shield:
         passed = np.flatnonzero(bounds.allowed.permits(candidates, self._tube_clearances(tube, around), rooms))
         if passed.shape[0] == 0:
             return passed
-        tube = tube.rows(passed)
-        hidden = self._sight.hidden(tube, around.view)
-        return passed[self._sight.permitted(bounds.hidden, tube, hidden, bounds.allowed.brake_stop_m, around.view)]
+        return passed[bounds.hidden.permits(self._sight.hidden(tube.rows(passed), around.view, bounds.hidden))]
 
     def _candidates(self, wanted: Floats, around: Surroundings, allowed: Allowance) -> Floats:
         """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""

@@ -42,7 +42,7 @@ class ReportFaults:
     def _told(self, item: Active, name: str, now: Snapshot) -> Snapshot:
         kept = self._kept.setdefault(item.number, now)
         if item.kind in _CLOCKS:
-            return replace(now, time_s=max(0.0, now.time_s + _CLOCKS[item.kind] * item["step_s"]))
+            return replace(now, time_s=now.time_s + _CLOCKS[item.kind] * item["step_s"])
         if name not in _PLACE:
             return now
         if item.kind == "report_freeze":

@@ -158,8 +158,8 @@ class Telemetry:
         now = self._snapshot()
         if self.faults is not None:
             now = self.faults.snapshot(name, now)
-        if self.booted_s:
-            now = replace(now, time_s=now.time_s - self.booted_s)
+        if self.booted_s or now.time_s < 0.0:
+            now = replace(now, time_s=max(0.0, now.time_s - self.booted_s))
         message = self._builders[name](now)
         if self.faults is not None:
             self.faults.alter(name, message, self.now_s())

@@ -26,7 +26,7 @@ from sim_gateway.simulation import Simulation, step_at
 from sim_gateway.telemetry import ONBOARD, Telemetry
 
 DOWNLINK_S, UPLINK_S, SCAN_S = 0.004, 0.008, 0.016
-BOOTED_S = -20.0  # the autopilot has been on for a while
+BOOTED_S = -60.0  # the autopilot has been on for a while
 STREAMED = frozenset(MESSAGES)
 POLL_STEPS = 2
 PARAMETERS = {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5.0, "COM_RC_OVERRIDE": 3.0}  # as `fly` and its users set them

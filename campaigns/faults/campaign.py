@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -16,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from campaigns.faults.catalogue import ELSEWHERE, IN_FLIGHT, Entry
 from campaigns.faults.ground import GROUND, VARIANTS, refused
+from campaigns.faults.oracle import Verdict
 from campaigns.faults.run import Case, play
 from campaigns.faults.scenes import FLIGHT_SCENES
 from campaigns.faults.stage import load
@@ -69,7 +71,15 @@ def run_case(case: Case, mission_file: Path, make_filter: Callable[..., SafetyFi
     expected = entry.expects(case.scene)
     _, verdict = play(entry, case.scene, case.seed, mission, runner, make_filter)
     bound_s = expected.bound_s if expected.bound_s > 0.0 else None
-    return Result(case.entry, case.scene, case.seed, expected.reaction.value, bound_s=bound_s, **asdict(verdict))
+    return result_of(case, expected.reaction.value, bound_s, verdict)
+
+
+def result_of(case: Case, expected: str, bound_s: float | None, verdict: Verdict) -> Result:
+    """The verdict as it is kept: what is not finite is None."""
+    values = asdict(verdict)
+    if not math.isfinite(verdict.fence_margin_m):
+        values["fence_margin_m"] = None
+    return Result(case.entry, case.scene, case.seed, expected, bound_s=bound_s, **values)
 
 
 def run_all(wanted: list[Case], mission_file: Path, jobs: int | None = None) -> list[Result]:

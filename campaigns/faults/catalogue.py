@@ -90,6 +90,7 @@ LASTS_S = 3.0
 TICK_S = 0.1  # one tick of the catalogue, phase included
 SAFE = Expected(Reaction.SAFE)
 FLY = Expected(Reaction.FLY)
+STALE_S = 0.3  # limit of 200 ms, one sample period of 20 ms and its way, one tick
 
 
 def _brake(bound_s: float, *rules: str, window_s: float = 2.9) -> Expected:
@@ -151,13 +152,14 @@ _LIDAR = (
     Entry("L18", "a second publisher", _brake(TICK_S, "scan_source", "scan_backwards", "scan_stale"),
           inject=injectors.second_scanner, felt="tick"),
 )  # fmt: skip
+_BETWEEN = "what changes between anchoring on the ground and the loop is not compared: residual risk"
 _ESTIMATE = (
     Entry("E1", "position jumps by 1 m and back", _brake(TICK_S, "estimate_jump", "estimate_jump_again"),
           _lasting("estimate_jump", 0.6), scenes=_in(SAFE, "engage"), note="over before the loop begins, in scene engage"),
     Entry("E2", "frozen odometry, fresh stamps", _brake(0.35, "estimate_frozen"), _lasting("report_freeze"),
           scenes=_in(SAFE, "hover", "braking"), note="seen only while 0.3 m/s or more is commanded"),
-    Entry("E3", "stale odometry", _brake(0.25, "state_stale"), _lasting("report_stale")),
-    Entry("E4", "NaN in the position", _brake(0.25, "state_stale"), _lasting("report_nan"),
+    Entry("E3", "stale odometry", _brake(STALE_S, "state_stale"), _lasting("report_stale")),
+    Entry("E4", "NaN in the position", _brake(STALE_S, "state_stale"), _lasting("report_nan"),
           note="a message with NaN is dropped: it is a stale estimate"),
     Entry("E5", "drift of 0.2 m/s, accuracy told", Expected(Reaction.HOLD, 1.5, ("estimate_inaccurate",), fence=False),
           _lasting("estimate_drift", 12.0, y_m_s=0.2), felt_after_s=4.0,
@@ -165,19 +167,22 @@ _ESTIMATE = (
     Entry("E6", "velocity is not that of the position", _brake(0.4, "velocity_mismatch"), _lasting("report_velocity")),
     Entry("E7", "yaw off by 90 degrees", SAFE, _lasting("estimate_yaw"),
           scenes=_in(_hold(1.5), "wall", "corner", "engage"), note="seen only in motion"),
-    Entry("E8", "estimator reset, origin moved", _hold(TICK_S, "estimate_reset", "estimate_jump"), _once("report_reset")),
-    Entry("E9", "altitude jumps by 1 m", _hold(TICK_S, "altitude_jump"), _lasting("estimate_jump", y_m=0.0, z_m=1.0)),
-    Entry("E10", "attitude is no rotation", _brake(0.25, "state_stale", "state_not_finite"), _lasting("report_attitude")),
+    Entry("E8", "estimator reset, origin moved", _hold(TICK_S, "estimate_reset", "estimate_jump"), _once("report_reset"),
+          scenes=_in(SAFE, "engage"), note=_BETWEEN),
+    Entry("E9", "altitude jumps by 1 m", _hold(TICK_S, "altitude_jump"), _lasting("estimate_jump", y_m=0.0, z_m=1.0),
+          scenes=_in(SAFE, "engage"), note=_BETWEEN),
+    Entry("E10", "attitude is no rotation", _brake(STALE_S, "state_stale", "state_not_finite"), _lasting("report_attitude")),
     Entry("E11", "estimator says velocity invalid", _hold(0.2, "estimate_invalid"), _lasting("report_invalid", 9.0)),
 )  # fmt: skip
 _LINK = (
-    Entry("K1", "downlink lost", _brake(0.25, "state_stale"), _lasting("link_down")),
+    Entry("K1", "downlink lost", _brake(STALE_S, "state_stale"), _lasting("link_down")),
     Entry("K2", "uplink lost", Expected(Reaction.STOP, 0.7), _lasting("link_up")),
-    Entry("K3", "both ways dead for 0.4 s of every 1.5 s", _brake(0.25, "state_stale", window_s=1.3),
-          _lasting("link_burst", burst_s=0.4, period_s=1.5), note="until a healthy second is over"),
+    Entry("K3", "both ways dead for 0.4 s of every 1.5 s", _brake(STALE_S, "state_stale", window_s=1.3),
+          _lasting("link_burst", burst_s=0.4, period_s=1.5), scenes=_in(SAFE, "engage"), note="until a healthy second is over"),
     Entry("K4", "0.3 s more delay, both ways", _hold(1.0, "link_slow", "state_stale"), _lasting("link_delay", 9.0)),
     Entry("K5", "duplicates and reordering", FLY, (*_lasting("link_duplicate"), *_lasting("link_reorder"))),
-    Entry("K6", "another program sends setpoints", _hold(1.0, "foreign_setpoint"), _lasting("rogue", 9.0, y_m_s=0.5)),
+    Entry("K6", "another program sends setpoints", _hold(1.0, "foreign_setpoint"),
+          _lasting("rogue", 9.0, y_m_s=0.5, rate_hz=31.0)),
     Entry("K7", "a second vehicle with the same ids", _yield(TICK_S), _lasting("link_foreign")),
     Entry("K8", "malformed messages", FLY, _lasting("link_garbage")),
     Entry("K9", "flood of 10,000 messages/s", FLY, _lasting("link_flood")),
@@ -190,7 +195,7 @@ _POLICY = (
     Entry("P2", "saturated action", SAFE, inject=injectors.policy_saturated, felt="tick"),
     Entry("P3", "action that aims at the nearest obstacle", SAFE, inject=injectors.policy_aims, felt="tick"),
     Entry("P4", "NaN in the hidden state", _brake(TICK_S, "command_missing", window_s=0.9),
-          inject=injectors.hidden_not_finite, felt="tick"),
+          inject=injectors.hidden_not_finite, felt="tick", scenes=_in(SAFE, "engage"), note="OFFBOARD begins with a zero state"),
     Entry("P5", "hidden state explodes", _brake(TICK_S, "hidden_exploded"), inject=injectors.hidden_explodes, felt="tick"),
     Entry("P6", "inference takes 40 ms once", SAFE, inject=injectors.inference_late, felt="tick",
           note="the delay lowers the speed cap, which 1 m/s does not reach"),
@@ -204,9 +209,12 @@ _COMPUTER = (
     Entry("C1", "SIGKILL of the control process", _brake(0.15), inject=injectors.process_dies,
           note="the guard's state machine goes on; as processes: the process-death matrix"),
     Entry("C4", "SIGSTOP for 2.5 s, SIGCONT", _brake(0.15), inject=injectors.process_stopped),
-    Entry("C5", "SIGTERM", _hold(TICK_S), inject=injectors.signalled),
-    Entry("C6", "unforeseen exception in the loop", _hold(TICK_S), inject=injectors.policy_raises, felt="tick"),
-    Entry("C7", "interpreter held for 0.25 s", _brake(0.15, window_s=0.29), inject=injectors.interpreter_held),
+    Entry("C5", "SIGTERM", _hold(TICK_S), inject=injectors.signalled, scenes=_in(_hold(1.5), "engage"),
+          note="the handshake of a second is finished first"),
+    Entry("C6", "unforeseen exception in the loop", _hold(TICK_S), inject=injectors.policy_raises, felt="tick",
+          scenes=_in(_hold(1.5), "engage")),
+    Entry("C7", "interpreter held for 0.25 s", _brake(0.15, window_s=0.29), inject=injectors.interpreter_held,
+          scenes=_in(SAFE, "engage")),
     Entry("C8", "every wake-up 60 to 120 ms late", _hold(0.5), inject=injectors.starved),
     Entry("C10", "disk full", FLY, inject=injectors.disk_full),
     Entry("C11", "wall clock jumps by an hour", FLY, inject=injectors.wall_clock_jumps),
@@ -225,7 +233,8 @@ _VEHICLE = (
     Entry("V6", "battery down to 12 %", _hold(1.0, "battery_low"), _once("battery", fraction=0.12)),
     Entry("V7", "velocity loop at 60 % of its gain", SAFE, _lasting("sluggish", 9.0, share=0.6)),
     Entry("V8", "gust of 3 m/s for 3 s", SAFE, _lasting("gust", x_m_s=3.0), note="inside the wind assumed in A1"),
-    Entry("V9", "landed while the policy flies", _yield(0.3), _lasting("report_landed")),
+    Entry("V9", "landed while the policy flies", _yield(0.3), _lasting("report_landed"), scenes=_in(_yield(1.6), "engage"),
+          note="in the handshake, when OFFBOARD begins"),
     Entry("V10", "speed not reached: six times the drag", FLY, _lasting("heavy")),
 )  # fmt: skip
 

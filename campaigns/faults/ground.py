@@ -185,7 +185,7 @@ GROUND: tuple[GroundEntry, ...] = (
             ("position_m: [20.0, 0.0, 2.0]", "position_m: [26.0, 0.0, 2.0]"),
             (_FENCE, "{min_m: [-0.5, -0.4, 0.5], max_m: [25.0, 0.4, 4.0]}"),
         ),
-        ("takeoff_point_m", "takeoff_point_m", "takeoff_height_m", "position_m", "fence y"),
+        ("takeoff_point_m", "takeoff_point_m", "takeoff_height_m", "position_m", "fence y|of the fence"),
     ),
     GroundEntry(
         "G4",
@@ -212,7 +212,7 @@ GROUND: tuple[GroundEntry, ...] = (
         ("takeoff_height_m", "takeoff_height_m", "heading_deg", "position_m", "max_yaw_rate_deg_s"),
     ),
     GroundEntry("G6", "YAML bomb, huge file, tag, NaN, text for a number", _bombs,
-                ("aliases|unknown key", "larger", "tag", "finite", "takeoff_height_m")),
+                ("aliases|unknown key", "larger", "tag|valid string", "finite", "takeoff_height_m")),
     GroundEntry("G7", "vehicle parameters that do not take", _parameters, ("COM_OF_LOSS_T|COM_OBL_RC_ACT",)),
     GroundEntry("G8", "unknown or old PX4", _version, ("PX4",)),
     GroundEntry("P8", "policy file missing, cut, altered, of another digest, no ONNX", _policy_file, ("Policy|No such file",)),

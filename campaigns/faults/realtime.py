@@ -13,14 +13,15 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from campaigns.faults.campaign import ENTRIES, Result, summarise
+from campaigns.faults.campaign import ENTRIES, Result, result_of, summarise
 from campaigns.faults.catalogue import Entry, Reaction
 from campaigns.faults.oracle import judge
+from campaigns.faults.run import Case
 from campaigns.faults.stage import Trace
 from campaigns.realtime import fence_margin_m
 from flight.mission import load_mission
@@ -129,10 +130,7 @@ def _judged(entry: Entry, report: dict[str, Any], summary: dict[str, Any], margi
     verdict = replace(verdict, outcome=outcome)
     if expected.reaction is Reaction.FLY and outcome != "goal_reached":
         verdict = replace(verdict, problem=f"the flight ended: {summary.get('message', outcome)}")
-    margin = verdict.fence_margin_m if math.isfinite(verdict.fence_margin_m) else None
-    bound_s = expected.bound_s if timed else None
-    values = asdict(verdict) | {"fence_margin_m": margin}
-    return Result(entry.id, SCENE, 1, expected.reaction.value, bound_s=bound_s, **values)
+    return result_of(Case(entry.id, SCENE, 1), expected.reaction.value, expected.bound_s if timed else None, verdict)
 
 
 def trace_of(report: dict[str, Any], felt_after_s: float = 0.0) -> Trace:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from campaigns.faults.catalogue import LASTS_S, Entry
 from campaigns.faults.oracle import Verdict, judge
-from campaigns.faults.scenes import SCENES
+from campaigns.faults.scenes import ENGAGE_S, SCENES
 from campaigns.faults.stage import Stage, Trace, felt_s
 from flight.mission import Mission
 from policy_export.runner import PolicyRunner
@@ -35,7 +35,7 @@ def play(
     make_filter: Callable[..., SafetyFilter] = SafetyFilter,
 ) -> tuple[Trace, Verdict]:
     """Fly it and judge it."""
-    duration_s = max(OBSERVED_S, entry.felt_after_s + OBSERVED_S)
+    duration_s = OBSERVED_S + entry.felt_after_s + (ENGAGE_S if SCENES[scene].before_offboard else 0.0)
     stage = Stage(SCENES[scene], mission, runner, seed, entry.faults, duration_s=duration_s, make_filter=make_filter)
     if entry.inject is not None:
         entry.inject(stage)

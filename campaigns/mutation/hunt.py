@@ -50,7 +50,8 @@ class Hunt:
         covering, exact = self.tests.covering(self.path, self.source, mutant.line)
         recent = {name: rank for rank, name in enumerate(self.killers.get(mutant.definition, []))}
         covering.sort(key=lambda name: (recent.get(name, len(recent)), name not in exact, self._seconds[name]))
-        total, chosen = 0.0, []
+        chosen: list[str] = []
+        total = 0.0
         for name in covering:
             total += self._seconds[name]
             if total <= self.budget_s or not chosen:

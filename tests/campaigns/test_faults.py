@@ -79,7 +79,7 @@ def test_refused_on_the_ground(fault: str) -> None:
 @pytest.mark.parametrize("scene", SCENES)
 def test_without_a_fault_every_scene_moves_and_stays_inside(scene: str) -> None:
     mission, runner = load(MISSION)
-    trace = Stage(SCENES[scene], mission, runner, 3, duration_s=2.0).play()
+    trace = Stage(SCENES[scene], mission, runner, 3, duration_s=3.5 if SCENES[scene].before_offboard else 2.0).play()
     moving = [time_s for time_s, velocity in trace.sent if any(velocity)]
     assert len(moving) > 30
     assert trace.contacts == 0

