@@ -137,6 +137,6 @@ def test_a_tube_is_as_long_as_the_braking_distance(speed):
 
 
 def test_a_figure_of_eight_is_no_fence():
-    eight = ((0.0, 0.0), (20.0, 10.0), (20.0, 0.0), (0.0, 10.0))
+    eight = ((0.0, 0.0), (20.0, 10.0), (20.0, 0.0), (0.0, 6.0))
     with pytest.raises(ValidationError, match="crosses"):
         Fence(floor_m=0.0, ceiling_m=4.0, inclusion=eight)
