@@ -170,6 +170,7 @@ def main() -> int:
         sys.pycache_prefix, sys.dont_write_bytecode = str(chosen.work / "pycache"), False
         known = TestMap(root, chosen.work / "tests.json", SLOW)
         known.refresh(chosen.jobs)
+        print(f"fail without any change, and judge nothing: {', '.join(known.broken) or 'none'}", flush=True)
         preload(known.modules)
         tests = orders(root, accidents, known)
     outcomes = []
@@ -177,10 +178,10 @@ def main() -> int:
         outcomes.append(outcome)
         who = ", ".join(outcome.tests) or outcome.problem or "nobody"
         print(f"{len(outcome.tests)} {outcome.accident.name}: {who}", flush=True)
-    result = report(outcomes)
-    if chosen.out:
-        chosen.out.write_text(json.dumps(result, indent=1) + "\n")
-    print(f"{result['noticed_by_two_tests_or_more']} of {len(outcomes)} accidents noticed by {LEAST_TESTS} tests or more")
+        if chosen.out:  # after each: a run that is stopped keeps what it has seen
+            chosen.out.write_text(json.dumps(report(outcomes), indent=1) + "\n")
+    noticed = sum(outcome.noticed for outcome in outcomes)
+    print(f"{noticed} of {len(outcomes)} accidents noticed by {LEAST_TESTS} tests or more")
     return 0 if outcomes and all(one.noticed for one in outcomes) else 1
 
 

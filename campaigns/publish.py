@@ -137,7 +137,7 @@ def publish() -> None:
     _write_block(README, BEGIN, END, f"{table(lockstep_rows(results) + realtime_rows(results))}\n\n{note}")
     if "process_death" in results:
         _write_block(SAFETY, *PROCESS_DEATH, process_death(results["process_death"]))
-    if "mutation" in results:
+    if "mutation" in results or "accidents" in results:
         _write_block(SAFETY, *STRENGTH, strength(results))
     if "adversaries" in results:
         _write_block(SAFETY, *ADVERSARIES, section(results["adversaries"]))

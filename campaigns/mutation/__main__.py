@@ -61,6 +61,7 @@ def main() -> int:
         ledger_path.unlink(missing_ok=True)
     tests = TestMap(root, chosen.work / "tests.json", chosen.without)
     print(f"recorded: {', '.join(tests.refresh(chosen.jobs)) or 'nothing new'}", flush=True)
+    print(f"fail without any change, and judge nothing: {', '.join(tests.broken) or 'none'}", flush=True)
     suite = suite_digest(root, chosen.budget_s)
     paths = chosen.module or list(sources(root))
     hunt_all(Task(root, paths, tests, ledger_path, suite, chosen.budget_s, chosen.sample, chosen.jobs, show))
@@ -70,6 +71,7 @@ def main() -> int:
     result |= {
         "cosmic_ray": importlib.metadata.version("cosmic-ray"),
         "tests": len(tests.seconds),
+        "broken_tests": tests.broken,
         "properties": len(properties(root)),
         "examples_per_property": EXAMPLES,
         "seconds": time.monotonic() - begin,

@@ -78,13 +78,17 @@ def _foreign() -> Iterator[str]:
 
 
 class TestMap:
-    """The whole map. `without`: names of test files that are not used (slow ones)."""
+    """The whole map. `without`: names of test files that are not used (slow ones).
+
+    `broken`: tests that fail without any change. They are told and judge nothing.
+    """
 
     __test__ = False
 
     def __init__(self, root: Path, store: Path, without: Collection[str] = ()) -> None:
         self._root, self._store, self._without = root, store, without
         self.files: dict[str, FileMap] = {}
+        self.broken: list[str] = []
 
     def refresh(self, at_once: int) -> list[str]:
         """Record the test files that are new or changed (all, when `safety/` or a helper changed); which ones."""
@@ -93,11 +97,12 @@ class TestMap:
         stale = [name for name, digest in wanted.items() if kept.get(name, {}).get("digest") != digest]
         jobs = (Job(name, partial(_record, self._root, name), RECORD_CPU_S) for name in stale)
         for name, answer in run_forked(iter(jobs), at_once):
-            if "ended" in answer or answer["failed"]:
+            if "ended" in answer or not set(answer["failed"]) <= set(answer["seconds"]):
                 raise BaselineError(f"{name} without any change: {answer.get('ended') or answer['failed']}")
             kept[name] = answer | {"digest": wanted[name]}
             self._store.write_text(json.dumps(kept))
         self.files = {name: _file_map(kept[name]) for name in wanted}
+        self.broken = sorted(test for name in wanted for test in kept[name]["failed"])
         return stale
 
     def _digests(self) -> dict[str, str]:
@@ -128,9 +133,9 @@ class TestMap:
         exact: set[str] = set()
         for one in self.files.values():
             ran = one.lines.get(path, {})
-            exact |= set(ran.get(line, ())) - {""}
+            exact |= set(ran.get(line, ())) & set(one.seconds)
             inside = _ran_in(ran, span)
-            names = one.seconds if "" in inside else inside  # run while importing: any test of the file may notice
+            names = set(one.seconds) if "" in inside else inside  # run while importing: any test of the file may notice
             found += [name for name in one.seconds if name in names]
         return found, exact
 
@@ -150,4 +155,5 @@ def _file_map(kept: Answer) -> FileMap:
     lines = {
         path: {int(line): [names[at] for at in tests] for line, tests in found.items()} for path, found in kept["lines"].items()
     }
-    return FileMap(kept["seconds"], lines, kept["modules"])
+    seconds = {test: s for test, s in kept["seconds"].items() if test not in kept["failed"]}
+    return FileMap(seconds, lines, kept["modules"])

@@ -7,8 +7,11 @@ import random
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from safety_plant import command, config
 
+from safety.braking import Start, tubes
+from safety.config import Fence, braking_distance_m
 from safety.fence import PolygonFence, polygon_fence, signed_area_m2
 from safety.frames import CorridorFrame, CorridorVector, NedVector
 from safety.limits import AT_REST, LastSent, limit_command, sent_after
@@ -122,3 +125,18 @@ def test_speed_yaw_and_climb_met_exactly_are_free():
         (-above.velocity.z, 0.5),
         (-above.yaw_rate_rad_s, 1.0),
     ]
+
+
+@pytest.mark.parametrize("speed", [0.3, 0.6, 0.61, 1.5, 4.0])
+def test_a_tube_is_as_long_as_the_braking_distance(speed):
+    """Below and above the speed at which the deceleration limit binds (b tau = 0.6 m/s here)."""
+    c = config(braking_m_s2=1.0, lag_s=0.6)
+    start = Start(np.zeros((2, 3)), np.tile((0.0, speed, 0.0), (2, 1)))
+    tube = tubes(start, np.array([[0.0, speed, 0.0]]), c)
+    assert (tube.stop_m - tube.turn_m)[..., 1] == pytest.approx(braking_distance_m(speed, 0.6, 1.0))
+
+
+def test_a_figure_of_eight_is_no_fence():
+    eight = ((0.0, 0.0), (20.0, 10.0), (20.0, 0.0), (0.0, 6.0))
+    with pytest.raises(ValidationError, match="crosses"):
+        Fence(floor_m=0.0, ceiling_m=4.0, inclusion=eight)

@@ -195,14 +195,19 @@ def test_ways_out_are_those_of_the_slow_way(seed):
         assert (found.normals[0, at], found.normals[1, at], found.room_m[at]) == pytest.approx((x, y, room), abs=1e-9)
 
 
-def test_right_on_an_edge_the_way_out_is_to_its_left():
-    fence = FenceGuard(PolygonFence(((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)), ()), 0.0, 3.0)
+SQUARE = ((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0))
+
+
+@pytest.mark.parametrize("ring", [SQUARE, (SQUARE[0], *SQUARE[:0:-1])])
+def test_right_on_an_edge_the_way_out_is_to_its_allowed_side(ring):
+    fence = FenceGuard(PolygonFence(ring, ()), 0.0, 3.0)
     place = np.array((2.0, 0.0, 1.0))
     start = Start(np.array((place, place)), np.zeros((2, 3)))
     tube = Tubes(np.tile(place, (2, 1, 1)), np.tile(place, (2, 1, 1)))
     ways = fence.ways_out(tube, fence.look(CorridorVector(*place), start, 0.5))
-    assert ways.normals[:, 0] == pytest.approx((0.0, 1.0))
-    assert ways.room_m[0] == 0.0
+    lower = int(np.argmin(ways.room_m))
+    assert ways.normals[:, lower] == pytest.approx((0.0, 1.0))
+    assert ways.room_m[lower] == 0.0
 
 
 @pytest.mark.parametrize(
@@ -221,3 +226,21 @@ def test_the_search_for_room_looks_where_it_always_looked(ring, holes, radius, s
     """Coarse cells first, halves only where room may hide: the same place every time."""
     found = PolygonFence(ring, holes, radius, slack).roomiest()
     assert found == (pytest.approx(place) if place else None)
+
+
+def test_a_tube_that_leads_away_from_an_edge_counts_where_it_begins():
+    guard = FenceGuard(PolygonFence(((0.0, 0.0), (6.0, 0.0), (6.0, 6.0), (0.0, 6.0)), (), 0.3, 0.0), 0.0, 3.0)
+    start = Start(np.array(((3.0, 0.4, 1.0), (3.0, 0.4, 1.0))), np.zeros((2, 3)))
+    tube = Tubes(np.array([[[3.0, 0.4, 1.0]], [[3.0, 0.5, 1.0]]]), np.array([[[3.0, 1.4, 1.0]], [[3.0, 1.5, 1.0]]]))
+    rooms = guard.rooms_m(tube, start, guard.look(CorridorVector(3.0, 0.4, 1.0), start, 0.5))
+    assert rooms[0] == pytest.approx([0.1, math.hypot(3.0, 0.4) - 0.3, 1.0, 2.0])
+
+
+def test_a_tube_past_the_corner_of_a_hole_counts_the_corner():
+    """Both ends are far from every edge; the way between them passes the corner at 0.4 m."""
+    hole = ((3.0, 1.4), (3.2, 3.0), (2.8, 3.0))
+    guard = FenceGuard(PolygonFence(((0.0, -3.0), (6.0, -3.0), (6.0, 6.0), (0.0, 6.0)), (hole,), 0.3, 0.0), 0.0, 3.0)
+    start = Start(np.array(((1.5, 1.0, 1.0), (1.5, 1.0, 1.0))), np.zeros((2, 3)))
+    tube = Tubes(np.tile((1.5, 1.0, 1.0), (2, 1, 1)), np.tile((4.5, 1.0, 1.0), (2, 1, 1)))
+    rooms = guard.rooms_m(tube, start, guard.look(CorridorVector(1.5, 1.0, 1.0), start, 4.0))
+    assert rooms[0, :-2].min() == pytest.approx(0.1)

@@ -111,8 +111,7 @@ REVIEWED = {
     "shield.FIRST_LOOK": 8,
     "shield.OUTWARD": (0.0, 0.1),
     "sight.STEP_M": 0.2,
-    "sight.OUT_M": 0.3,
-    "sight.LEAST_WAY_M": 1e-06,
+    "sight.ROUNDING_M": 1e-09,
 }
 
 
