@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sim_gateway.collision import clearance_m
+from sim_gateway.errors import DivergedError
 from sim_gateway.estimate import PROCESSES, VELOCITY_ERROR, step_error
 from sim_gateway.scene import place_movers
 from sim_gateway.vehicle import MOTOR, OMEGA, POS, QUAT, STEP_S, VEL, step_motors_off, step_velocity
@@ -29,18 +30,6 @@ LEAST_CLEARANCE, _TOUCHING, CONTACTS, FLOWN = 0, 1, 2, 3
 
 _WATCHED = MOTOR + 4  # leading entries of the state row that must stay finite
 _STATE_NAMES = ((POS, "position"), (VEL, "velocity"), (QUAT, "attitude"), (OMEGA, "angular rate"), (MOTOR, "motors"))
-
-
-class DynamicsError(RuntimeError):
-    """The vehicle cannot be simulated, or no longer."""
-
-
-class DynamicsMissingError(DynamicsError):
-    """These dynamics are not installed; the message says what to install."""
-
-
-class DivergedError(DynamicsError):
-    """A state of the vehicle is no longer a finite number; the message names it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +81,12 @@ class InternalDynamics:
 
     def advance(self, course: Course, demand: Demand, normals: Array, first_step: int) -> None:
         """See `Dynamics.advance`."""
-        _advance(
+        reached = _advance(
             *(course.state, demand.params, demand.velocity_sp, demand.yaw_rate_sp, demand.motors_on, normals, first_step),
             *(course.boxes, course.fixed, course.movers, course.error, course.error_coefficients),
             *(demand.wind_mean, course.gust, course.gust_coefficients, course.contact_radius_m, course.log),
         )
-        check_finite(course.state, first_step + normals.shape[0], "the vehicle")
+        check_finite(course.state, reached, "the vehicle")
 
 
 def make_dynamics(name: str, params: VehicleParams) -> Dynamics:
@@ -168,7 +157,7 @@ def _advance(  # type: ignore[no-untyped-def]
     state, params, velocity_sp, yaw_rate_sp, motors_on, normals, first_step,
     boxes, fixed, movers, error, error_coefficients, wind_mean, gust, gust_coefficients, radius, log,
 ):  # fmt: skip
-    """All steps of the internal vehicle, in one call."""
+    """All steps of the internal vehicle, in one call; ends at the first state that is not finite. Gives the step reached."""
     wind = np.empty(3)
     for step in range(normals.shape[0]):
         before_step(normals[step], wind, wind_mean, gust, gust_coefficients, error, error_coefficients)
@@ -177,4 +166,7 @@ def _advance(  # type: ignore[no-untyped-def]
             step_velocity(state, params, velocity_sp, yaw_rate_sp, wind, error[VELOCITY_ERROR : VELOCITY_ERROR + 3], 1)
         else:
             step_motors_off(state, params, wind, 1)
+        if _first_not_finite(state) >= 0:
+            return first_step + step + 1
         after_step(state, x, y, z, first_step + step, boxes, fixed, movers, radius, log)
+    return first_step + normals.shape[0]

@@ -20,8 +20,8 @@ import numpy as np
 from numba import njit
 
 from sim_gateway import vehicle_params as vp
-from sim_gateway.dynamics import Array, Course, Demand, DivergedError, DynamicsError, DynamicsMissingError
-from sim_gateway.dynamics import after_step, before_step, check_finite
+from sim_gateway.dynamics import Array, Course, Demand, after_step, before_step, check_finite
+from sim_gateway.errors import DivergedError, DynamicsError, DynamicsMissingError
 from sim_gateway.estimate import VELOCITY_ERROR
 from sim_gateway.vehicle import ACC, ALPHA, LANDED, MOTOR, OMEGA, POS, QUAT, STEP_S, VEL, drive_motors, touch_down
 from sim_gateway.vehicle_params import GRAVITY_M_S2, VehicleParams

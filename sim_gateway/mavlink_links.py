@@ -146,12 +146,14 @@ class MavlinkLink(ABC):
 class UdpLink(MavlinkLink):
     """A UDP link on loopback: to its default client port and to every loopback address that has spoken to it lately."""
 
-    def __init__(self, name: str, own_port: int, client_port: int, column: int, now_s: Callable[[], float]) -> None:
+    def __init__(
+        self, name: str, own_port: int, client_port: int, column: int, now_s: Callable[[], float], system_id: int = SYSTEM_ID
+    ) -> None:
         super().__init__(name, column, now_s)
         self.socket = _bind(own_port, f"{name} link")
         self._client = (LOOPBACK, client_port)
         self._peers: dict[tuple[str, int], float] = {}
-        self._packer = mav.MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=COMPONENT_ID)
+        self._packer = mav.MAVLink(None, srcSystem=system_id, srcComponent=COMPONENT_ID)
 
     def close(self) -> None:
         """Free the port."""
