@@ -304,14 +304,15 @@ def run_together(gateways: Sequence[Gateway], stop: threading.Event) -> None:
             behind_s = pace.behind_s(time.monotonic(), first.vehicle.time_s)
             first.tell_dropped()
             for _ in range(min(int(behind_s / STEP_S), _MAX_STEPS_PER_TURN)):
-                _step_all(gateways)
+                step_all(gateways)
             _wait(gateways, pace.due_s((first.vehicle.simulation.steps + 1) * STEP_S) - time.monotonic())
     finally:
         for gateway in gateways:
             gateway.write_report()
 
 
-def _step_all(gateways: Sequence[Gateway]) -> None:
+def step_all(gateways: Sequence[Gateway]) -> None:
+    """One physics step of every vehicle. Raises `DivergedError`; that vehicle's report will say so."""
     for gateway in gateways:
         try:
             gateway.step()
