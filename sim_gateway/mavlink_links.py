@@ -67,6 +67,7 @@ class MavlinkLink(ABC):
         self.streams = {name: _Stream(interval, 0.0) for name, interval in self._defaults.items()}
         self.parameter_queue: deque[str] = deque()
         self.gcs_heard_s = -math.inf
+        self._next_due_s = -math.inf
         self._text_id = 0
 
     @property
@@ -115,6 +116,7 @@ class MavlinkLink(ABC):
             self.streams.pop(name, None)
         else:
             self.streams[name] = _Stream(interval_s, self._now_s())
+        self._next_due_s = -math.inf
 
     def interval_us(self, name: str) -> int:
         """The interval in force; -1 when the message is not streamed."""
@@ -123,12 +125,16 @@ class MavlinkLink(ABC):
 
     def due(self, available: Callable[[str], bool]) -> list[str]:
         """Names of the messages whose time has come. A stream that fell behind skips what it missed."""
-        now_s, names = self._now_s(), []
+        names: list[str] = []
+        now_s = self._now_s()
+        if now_s < self._next_due_s - 1e-9:
+            return names
         for name, stream in self.streams.items():
             if now_s >= stream.due_s - 1e-9 and available(name):
                 names.append(name)
                 behind = now_s - stream.due_s > stream.interval_s
                 stream.due_s = now_s + stream.interval_s if behind else stream.due_s + stream.interval_s
+        self._next_due_s = min((stream.due_s for stream in self.streams.values()), default=math.inf)
         return names
 
     # ---- in

@@ -227,7 +227,7 @@ class Simulation:
         when the vehicle's state is no longer finite.
         """
         setpoint = np.array(velocity_sp, dtype=np.float64)
-        if setpoint.shape != (3,) or not np.isfinite(setpoint).all() or not math.isfinite(yaw_rate_sp):
+        if setpoint.shape != (3,) or not all(map(math.isfinite, (*setpoint.tolist(), yaw_rate_sp))):
             raise ValueError(f"setpoint {velocity_sp}, {yaw_rate_sp}: give three finite velocities and a finite yaw rate")
         self._step(n_steps, setpoint, float(yaw_rate_sp), motors_on=True)
 
