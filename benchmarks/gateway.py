@@ -49,7 +49,13 @@ def speed_figures() -> list[Figure]:
             seconds = _processor_s(lambda v=vehicle: fly([v], v.advance, SPEED_SPAN_S, v.simulation.scan))  # type: ignore[misc]
             taken[name].append(SPEED_SPAN_S / seconds)
     return [
-        _figure(f"vehicle, autopilot and LiDAR, {name} dynamics", sorted(taken[name])[ROUNDS // 2], "x real time", target, at_least=True)
+        _figure(
+            f"vehicle, autopilot and LiDAR, {name} dynamics",
+            sorted(taken[name])[ROUNDS // 2],
+            "x real time",
+            target,
+            at_least=True,
+        )
         for name, target in SPEED_TARGETS.items()
     ]
 
@@ -76,7 +82,13 @@ def memory_figures(minutes: float) -> list[Figure]:
     name = f"one vehicle over {minutes:g} simulated minutes"
     return [
         _figure(f"{name}: slope after a sixth", slope_mib_h(resident, minutes), "MiB/h", SLOPE_MIB_H),
-        {"name": f"{name}: resident", "value": resident[-1], "unit": "MiB", "peer": resident[0], "ratio": resident[-1] / resident[0]},
+        {
+            "name": f"{name}: resident",
+            "value": resident[-1],
+            "unit": "MiB",
+            "peer": resident[0],
+            "ratio": resident[-1] / resident[0],
+        },
     ]
 
 

@@ -51,8 +51,9 @@ class FlightRecorder:
         self._rows[self._count] = [round(value, 5) for value in row]
         self._count += 1
         if self._count >= _MAX_ROWS:
-            self._count = (self._count + 1) // 2
-            self._rows[: self._count] = self._rows[::2].copy()
+            kept = self._rows[: self._count : 2].copy()
+            self._count = len(kept)
+            self._rows[: self._count] = kept
             self._interval_steps *= 2
         self._next_sample += self._interval_steps
 

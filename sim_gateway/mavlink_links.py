@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.autopilot import StatusText
 from sim_gateway.link_faults import Garbage, LinkFaults
+from sim_gateway.mavlink_frame import FramePacker
 from sim_gateway.telemetry import COMPONENT_ID, STREAM_RATES_HZ, SYSTEM_ID, Message
 
 LOOPBACK = "127.0.0.1"
@@ -159,7 +160,7 @@ class UdpLink(MavlinkLink):
         self.socket = _bind(own_port, f"{name} link")
         self._client = (LOOPBACK, client_port)
         self._peers: dict[tuple[str, int], float] = {}
-        self._packer = mav.MAVLink(None, srcSystem=system_id, srcComponent=COMPONENT_ID)
+        self._packer = FramePacker(system_id, COMPONENT_ID)
 
     def close(self) -> None:
         """Free the port."""
@@ -168,7 +169,7 @@ class UdpLink(MavlinkLink):
     def _transmit(self, message: Message | Garbage) -> None:
         """To all peers; a full or unreachable socket loses the message, as UDP does."""
         try:
-            data = message.data if isinstance(message, Garbage) else message.pack(self._packer)
+            data = message.data if isinstance(message, Garbage) else self._packer.pack(message)
         except (struct.error, OverflowError, ValueError) as error:
             _log.error("%s has a value outside its field: %s", message, error)
             return
