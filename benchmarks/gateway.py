@@ -48,14 +48,9 @@ def speed_figures() -> list[Figure]:
         for name, vehicle in vehicles.items():
             seconds = _processor_s(lambda v=vehicle: fly([v], v.advance, SPEED_SPAN_S, v.simulation.scan))  # type: ignore[misc]
             taken[name].append(SPEED_SPAN_S / seconds)
+    middle = {name: sorted(factors)[ROUNDS // 2] for name, factors in taken.items()}
     return [
-        _figure(
-            f"vehicle, autopilot and LiDAR, {name} dynamics",
-            sorted(taken[name])[ROUNDS // 2],
-            "x real time",
-            target,
-            at_least=True,
-        )
+        _figure(f"vehicle, autopilot and LiDAR, {name} dynamics", middle[name], "x real time", target, at_least=True)
         for name, target in SPEED_TARGETS.items()
     ]
 
@@ -80,15 +75,10 @@ def memory_figures(minutes: float) -> list[Figure]:
     done = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True, timeout=DEADLINE_S, check=True)
     resident: list[float] = json_module.loads(done.stdout)
     name = f"one vehicle over {minutes:g} simulated minutes"
+    ratio = resident[-1] / resident[0]
     return [
         _figure(f"{name}: slope after a sixth", slope_mib_h(resident, minutes), "MiB/h", SLOPE_MIB_H),
-        {
-            "name": f"{name}: resident",
-            "value": resident[-1],
-            "unit": "MiB",
-            "peer": resident[0],
-            "ratio": resident[-1] / resident[0],
-        },
+        {"name": f"{name}: resident", "value": resident[-1], "unit": "MiB", "peer": resident[0], "ratio": ratio},
     ]
 
 

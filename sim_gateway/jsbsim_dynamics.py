@@ -122,7 +122,8 @@ def _load(params: VehicleParams) -> Any:
         import jsbsim  # noqa: PLC0415  (optional)
     except ImportError:
         raise DynamicsMissingError("JSBSim is not installed: pip install 'lstm-pilot[jsbsim]'") from None
-    jsbsim.FGJSBBase().debug_lvl = 0  # before anything else: JSBSim prints to stdout
+    base: Any = jsbsim.FGJSBBase
+    base().debug_lvl = 0  # before anything else: JSBSim prints to stdout
     fdm = jsbsim.FGFDMExec(None)
     fdm.set_debug_level(0)
     text = resources.files("sim_gateway").joinpath("aircraft", "quad_x.xml").read_text(encoding="utf-8")
