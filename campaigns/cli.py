@@ -24,6 +24,7 @@ class Dynamics(StrEnum):
     """What flies: the gateway's vehicle in lockstep."""
 
     INTERNAL = "internal"
+    JSBSIM = "jsbsim"
 
 
 class Switch(StrEnum):
@@ -54,7 +55,9 @@ def evaluate(
     from campaigns.splits import load_split
     from flight.mission import load_mission
     from policy_export.runner import PolicyRunner
+    from sim_gateway.dynamics import require_dynamics
 
+    require_dynamics(dynamics.value)
     chosen = load_split(split, splits)
     if seed is not None:
         chosen = chosen.model_copy(update={"first_seed": seed})
@@ -63,7 +66,7 @@ def evaluate(
         PolicyRunner.load(policy)  # a bad file is refused before any work is done
     reports = []
     for policy in policies:
-        campaign = Campaign(policy, chosen, flown.safety, safety is Switch.ON, flown.goal.radius_m)
+        campaign = Campaign(policy, chosen, flown.safety, safety is Switch.ON, flown.goal.radius_m, dynamics.value)
         results = run_campaign(campaign, episodes, workers)
         reports.append(report(campaign, split, results))
     _write(reports, out, as_json)
@@ -92,6 +95,7 @@ def markdown(one: dict[str, Any]) -> str:
     rows = [
         ("policy", f"{one['policy']} ({one['policy_sha256'][:12]})"),
         ("corridors", f"{one['split']}: {one['description']}, seeds from {one['first_seed']}"),
+        ("dynamics", one["dynamics"]),
         ("safety layer", "on" if one["safety"] else "off"),
         ("clean success (goal within 0.3 m, no contact), 95 % interval", rate("clean_success")),
         ("success (contacts allowed)", rate("success")),

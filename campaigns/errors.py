@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from flight.errors import FlyError
 from policy_export.errors import PolicyFileError, PolicyRateError
+from sim_gateway.errors import DynamicsError
 from strict_yaml import ConfigError
 
-USER_ERRORS = (ConfigError, FlyError, PolicyFileError, PolicyRateError)
+USER_ERRORS = (ConfigError, DynamicsError, FlyError, PolicyFileError, PolicyRateError)

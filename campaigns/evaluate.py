@@ -33,6 +33,7 @@ class Campaign:
     safety: SafetyConfig
     filtered: bool = True
     arrival_radius_m: float = 0.2
+    dynamics: str = "internal"
 
     def stack(self) -> StackConfig:
         """The conditions of every episode."""
@@ -43,6 +44,7 @@ class Campaign:
             takeoff_height_m=self.split.takeoff_height_m,
             arrival_radius_m=self.arrival_radius_m,
             estimate=self.split.estimate,
+            dynamics=self.dynamics,
             wind=WindConfig(self.split.wind_m_s, self.split.gust_sigma_m_s),
             lidar=LidarConfig.device(self.split.dropout),
         )
@@ -93,7 +95,7 @@ def report(campaign: Campaign, split_name: str, results: list[EpisodeResult]) ->
         "split": split_name,
         "description": campaign.split.description,
         "first_seed": campaign.split.first_seed,
-        "dynamics": "internal",
+        "dynamics": campaign.dynamics,
         "safety": campaign.filtered,
         **summarise(results),
         "episodes": [asdict(r) for r in results],

@@ -23,11 +23,13 @@ from safety.filter import SafetyFilter
 from safety.frames import CorridorVector
 from safety.messages import BRAKE, Health, LidarScan, SafeCommand, VehicleState, VelocityCommand, Verdict
 from sim_gateway.collision import clearance_m
+from sim_gateway.errors import DivergedError
 from sim_gateway.lidar import LidarConfig
 from sim_gateway.paths import shortest_path_length
 from sim_gateway.scene import World
 from sim_gateway.simulation import Motion, Scan, Simulation, WindConfig, step_at
 from sim_gateway.vehicle import STEP_S
+from sim_gateway.vehicle_params import PROFILES
 
 TICK_S = 0.05
 _OVERRULED = Health(overruled=True, inference_s=0.0)  # zero was sent last; the computer's own times are not judged here
@@ -54,6 +56,8 @@ class StackConfig:
     arrival_radius_m: float = 0.2
     time_limit_s: float = 90.0
     estimate: str = "nominal"
+    dynamics: str = "internal"
+    vehicle: str = "iris"
     wind: WindConfig = field(default_factory=WindConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig.device)
     scan_age_s: float = 0.02
@@ -83,6 +87,7 @@ class _Watch:
     least_distance_m: float = math.inf
     first_contact: str | None = None
     left_fence: bool = False
+    diverged: bool = False
     velocities: list[tuple[float, float, float]] = field(default_factory=list)
 
 
@@ -93,11 +98,13 @@ class LockstepFlight:
         self.world, self.config = world, config
         self.simulation = Simulation(
             world,
+            PROFILES[config.vehicle],
             lidar=config.lidar,
             estimate=config.estimate,
             wind=config.wind,
             seed=world.seed if seed is None else seed,
             hover_height_m=config.takeoff_height_m,
+            dynamics=config.dynamics,
         )
         self.goal = CorridorVector(*world.goal)
         self.filter = (SafetyFilter if config.filtered else Unfiltered)(config.safety)
@@ -110,7 +117,10 @@ class LockstepFlight:
         self._braked = False
 
     def run(self) -> EpisodeResult:
-        """Fly until the goal (and one second of braking) or until the time is up; contacts are counted and flown through."""
+        """Fly until the goal (and one second of braking) or until the time is up; contacts are counted and flown through.
+
+        A vehicle that can no longer be simulated ends the flight as a failure.
+        """
         self.pilot.reset()
         reached_s = stopped_s = math.inf
         tick = 0
@@ -122,7 +132,11 @@ class LockstepFlight:
                 stopped_s = now_s + BRAKE_AFTER_GOAL_S
             if now_s >= min(stopped_s, self.config.time_limit_s):
                 break
-            self._fly_to((tick + 1) * TICK_S)
+            try:
+                self._fly_to((tick + 1) * TICK_S)
+            except DivergedError:
+                self._watch.diverged = True
+                break
             tick += 1
         return self._result(reached_s, tick)
 
@@ -174,8 +188,8 @@ class LockstepFlight:
 
     def _result(self, reached_s: float, ticks: int) -> EpisodeResult:
         simulation, watch = self.simulation, self._watch
-        success = math.isfinite(reached_s) and watch.least_distance_m <= SUCCESS_RADIUS_M
-        failure = watch.first_contact or ("fence" if watch.left_fence else None)
+        success = not watch.diverged and math.isfinite(reached_s) and watch.least_distance_m <= SUCCESS_RADIUS_M
+        failure = "diverged" if watch.diverged else watch.first_contact or ("fence" if watch.left_fence else None)
         if failure is None and not success:
             failure = "missed_goal" if math.isfinite(reached_s) else "timeout"
         start = (*self.world.start[:2], self.config.takeoff_height_m)

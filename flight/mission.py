@@ -126,7 +126,8 @@ class SimSection(_Section):
 
     world: Path
     seed: int = Field(default=0, ge=0, lt=2**63)
-    dynamics: Literal["internal"] = "internal"
+    dynamics: Literal["internal", "jsbsim"] = "internal"
+    vehicle: Literal["iris", "sih_quadx"] = Field(default="iris", description="profile of the simulated vehicle")
     estimate: Literal["none", "nominal", "px4_sih"] = Field(default="nominal", description="errors of the vehicle's own estimate")
     wind_m_s: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     onboard_port: Port = 14540

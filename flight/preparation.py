@@ -45,7 +45,18 @@ def gateway_arguments(mission: Mission) -> list[str]:
     sim = mission.sim
     if sim is None:
         raise MissionError("the mission has no `sim` section: the simulator cannot be started")
-    arguments = ["--world", str(sim.world), "--seed", str(sim.seed), "--dynamics", sim.dynamics, "--estimate", sim.estimate]
+    arguments = [
+        "--world",
+        str(sim.world),
+        "--seed",
+        str(sim.seed),
+        "--dynamics",
+        sim.dynamics,
+        "--vehicle",
+        sim.vehicle,
+        "--estimate",
+        sim.estimate,
+    ]
     arguments += [f"--fault={fault}" for fault in sim.faults]
     arguments += ["--onboard-port", str(sim.onboard_port), "--gcs-port", str(sim.gcs_port)]
     arguments += ["--lidar-port", str(mission.lidar.port), "--wind=" + ",".join(map(repr, sim.wind_m_s))]

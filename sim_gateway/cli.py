@@ -32,11 +32,16 @@ sim-gateway --world configs/worlds/paper.yaml --onboard-port 14541 --lidar-port 
 
 sim-gateway --world configs/worlds/corridor.yaml --fault lidar_freeze@offboard:12+3 --fault battery@40:fraction=0.1
 
+sim-gateway --world configs/worlds/corridor.yaml --dynamics jsbsim --vehicle sih_quadx
+
+sim-gateway --world configs/worlds/corridor.yaml --vehicles 3
+
 sim-gateway --world configs/worlds/corridor.yaml --serial-lidar ld06 --serial-link /tmp/lidar
 
 Then connect a MAVSDK client to udpin://127.0.0.1:14540 and a Hokuyo SCIP driver to 127.0.0.1:10940.
 """
-_HIGHEST_PORT = 65535 - 4020  # the gateway's own ports lie up to this far above the client's
+_MOST_VEHICLES = 40  # then the onboard ports would meet the gateway's own
+_HIGHEST_PORT = 65535 - 4020 - _MOST_VEHICLES  # the gateway's own ports lie up to this far above the client's
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich")
 
@@ -45,6 +50,14 @@ class Dynamics(StrEnum):
     """What moves the vehicle."""
 
     internal = "internal"
+    jsbsim = "jsbsim"
+
+
+class Vehicle(StrEnum):
+    """Profiles of vehicles, as in `vehicle_params.PROFILES`."""
+
+    iris = "iris"
+    sih_quadx = "sih_quadx"
 
 
 class Estimate(StrEnum):
@@ -73,7 +86,11 @@ def serve(
     seed: Annotated[int | None, typer.Option(min=0, help="Replaces the world's seed; also seeds noise and gusts.")] = None,
     start: Annotated[str | None, typer.Option(metavar="X,Y", help="Replaces the world's start, m.")] = None,
     goal: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Replaces the world's goal, m (only reported).")] = None,
-    dynamics: Annotated[Dynamics, typer.Option(help="Vehicle dynamics.")] = Dynamics.internal,
+    dynamics: Annotated[Dynamics, typer.Option(help="What moves the vehicle; jsbsim is an extra.")] = Dynamics.internal,
+    vehicle: Annotated[Vehicle, typer.Option(help="Which vehicle: Iris class, or PX4's SIH quad X.")] = Vehicle.iris,
+    vehicles: Annotated[
+        int, typer.Option(min=1, max=_MOST_VEHICLES, help="How many, side by side; each has the next system id and ports.")
+    ] = 1,
     estimate: Annotated[Estimate, typer.Option(help="Errors of the vehicle's own state estimate.")] = Estimate.nominal,
     wind: Annotated[str, typer.Option(metavar="X,Y,Z", help="Steady wind in the corridor frame, m/s.")] = "0,0,0",
     heading: Annotated[float, typer.Option(help="Compass heading of the corridor's x axis, degrees.")] = 0.0,
@@ -108,6 +125,8 @@ def serve(
         onboard_port=onboard_port,
         gcs_port=gcs_port,
         lidar_port=lidar_port,
+        dynamics=dynamics.value,
+        vehicle=vehicle.value,
         estimate=estimate.value,
         wind_m_s=_triple("--wind", wind),
         heading_rad=math.radians(_finite("--heading", heading)),
@@ -118,11 +137,13 @@ def serve(
         serial_link=serial_link,
         faults=_faults(fault or [], faults),
     )
-    _serve(scene, config, quit_with_parent)
+    _serve(scene, config, vehicles, quit_with_parent)
 
 
-def _serve(world: World, config: GatewayConfig, quit_with_parent: bool) -> None:
-    from sim_gateway.gateway import Gateway, warm_up
+def _serve(world: World, config: GatewayConfig, vehicles: int, quit_with_parent: bool) -> None:
+    from sim_gateway.errors import DynamicsMissingError
+    from sim_gateway.fleet import Fleet, NoRoomError
+    from sim_gateway.gateway import warm_up
     from sim_gateway.mavlink_links import PortInUseError
     from sim_gateway.scip import ScipServerError
 
@@ -131,24 +152,27 @@ def _serve(world: World, config: GatewayConfig, quit_with_parent: bool) -> None:
         signal.signal(number, lambda *_: stop.set())
     if quit_with_parent:
         _follow_parent(stop)
-    warm_up(world)
     try:
-        gateway = Gateway(world, config)
+        warm_up(world, config.dynamics)
+        fleet = Fleet(world, config, vehicles)
+    except DynamicsMissingError as error:
+        raise _UsageError(str(error)) from None
+    except NoRoomError as error:
+        raise _UsageError(f"{error}: fewer --vehicles, or another --start") from None
     except PortInUseError as error:
         raise _UsageError(f"{error}: stop the program there, or choose another with --onboard-port or --gcs-port") from None
     except ScipServerError as error:
         raise _UsageError(f"{error} with --lidar-port") from None
     except FileExistsError:
         raise _UsageError(f"--serial-link {config.serial_link} exists and is not a link: choose another name") from None
-    with gateway:
-        print(json.dumps(gateway.ready_message()), flush=True)
-        logging.getLogger("sim_gateway").info(
-            "world %s: MAVLink to udpin://127.0.0.1:%d, LiDAR on TCP port %d; Ctrl-C stops",
-            world.name,
-            config.onboard_port,
-            gateway.lidar.port,
-        )
-        gateway.run(stop)
+    with fleet:
+        print(json.dumps(fleet.ready_message()), flush=True)
+        for gateway in fleet.gateways:
+            logging.getLogger("sim_gateway").info(
+                "world %s, vehicle %d: MAVLink to udpin://127.0.0.1:%d, LiDAR on TCP port %d; Ctrl-C stops",
+                *(world.name, gateway.config.system_id, gateway.config.onboard_port, gateway.lidar.port),
+            )
+        fleet.run(stop)
 
 
 def _follow_parent(stop: threading.Event) -> None:
@@ -242,11 +266,15 @@ def _log_to_stderr(verbose: bool) -> None:
 
 
 def main() -> None:
-    """Entry point: a user's mistake is one line on stderr and exit code 2."""
+    """Entry point: a user's mistake is one line on stderr and exit code 2; a vehicle that diverged, exit code 1."""
+    from sim_gateway.errors import DivergedError
     from strict_yaml import ConfigError
 
     try:
         code = app(standalone_mode=False)
+    except DivergedError as error:
+        print(f"sim-gateway: {error}", file=sys.stderr)
+        code = 1
     except (_UsageError, ConfigError) as error:
         print(f"sim-gateway: {error}", file=sys.stderr)
         code = 2

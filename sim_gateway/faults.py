@@ -243,7 +243,7 @@ class FaultSchedule:
 
     def has(self, group: str) -> bool:
         """Whether any fault of a group has a time."""
-        return any(KINDS[item.kind].group == group for item in self._placed)
+        return bool(self._placed) and any(KINDS[item.kind].group == group for item in self._placed)
 
     def next_edge_s(self, group: str, time_s: float) -> float:
         """The next time after `time_s` at which a fault of a group begins or ends."""

@@ -8,6 +8,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sim_gateway.autopilot import ModeChange
 from sim_gateway.simulation import Simulation
 
@@ -23,7 +25,8 @@ class FlightRecorder:
     def __init__(self, simulation: Simulation, facts: dict[str, Any]) -> None:
         self._simulation = simulation
         self._facts = facts
-        self.rows: list[tuple[float, ...]] = []
+        self._rows = np.full((_MAX_ROWS, len(TRAJECTORY_COLUMNS)), math.nan)  # all of it from the start: memory stays flat
+        self._count = 0
         self.events: list[dict[str, Any]] = []
         self.contacts = 0
         self.min_clearance_m = math.inf
@@ -45,11 +48,20 @@ class FlightRecorder:
     def _sample(self) -> None:
         truth = self._simulation.truth
         row = (truth.time_s, *truth.position_m, *truth.velocity_m_s, truth.yaw_rad)
-        self.rows.append(tuple(round(value, 5) for value in row))
-        if len(self.rows) >= _MAX_ROWS:
-            del self.rows[1::2]
+        self._rows[self._count] = [round(value, 5) for value in row]
+        self._count += 1
+        if self._count >= _MAX_ROWS:
+            kept = self._rows[: self._count : 2].copy()
+            self._count = len(kept)
+            self._rows[: self._count] = kept
             self._interval_steps *= 2
         self._next_sample += self._interval_steps
+
+    @property
+    def rows(self) -> list[list[float]]:
+        """The samples so far, each as in `TRAJECTORY_COLUMNS`."""
+        rows: list[list[float]] = self._rows[: self._count].tolist()
+        return rows
 
     def note(self, change: ModeChange) -> None:
         """A mode change, an arming or a disarming."""

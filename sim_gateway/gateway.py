@@ -1,4 +1,7 @@
-"""The gateway in real time: one simulated vehicle, its autopilot, its MAVLink links and its LiDAR, paced by the clock."""
+"""The gateway in real time: a simulated vehicle, its autopilot, its MAVLink links and its LiDAR, paced by the clock.
+
+Several vehicles are several `Gateway`s under one pace (`run_together`, `fleet`).
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import math
 import select
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_gateway.errors import DynamicsError
 from sim_gateway.faults import Fault
 from sim_gateway.flight_report import FlightRecorder, write_json_atomically
 from sim_gateway.incidents import Incidents
@@ -31,6 +35,7 @@ from sim_gateway.serial_lidar import SerialLidar
 from sim_gateway.simulation import Scan, Simulation, WindConfig, step_at
 from sim_gateway.telemetry import Telemetry
 from sim_gateway.vehicle import STEP_S
+from sim_gateway.vehicle_params import PROFILES
 
 # distance from the port a client listens on to the gateway's own port, as in PX4's SITL (14580 - 14540, 18570 - 14550)
 ONBOARD_PORT_OFFSET, GROUND_PORT_OFFSET = 40, 4020
@@ -45,13 +50,18 @@ _log = logging.getLogger("sim_gateway")
 class GatewayConfig:
     """How to run. Ports are those the clients use; `gcs_port` 0 leaves that link out, `lidar_port` 0 takes a free one.
 
-    `serial_lidar`: also a spinning LiDAR of this kind (`serial_lidar.KINDS`) on a pseudo-terminal, `serial_link` a name for it.
+    `dynamics`: a name of `dynamics.DYNAMICS`, `vehicle` one of `vehicle_params.PROFILES`. `system_id`: 1 to 250; as with PX4's
+    instances, the own ground station port lies that many less one further up. `serial_lidar`: also a spinning LiDAR of this kind
+    (`serial_lidar.KINDS`) on a pseudo-terminal, `serial_link` a name for it.
     """
 
     seed: int = 0
     onboard_port: int = 14540
     gcs_port: int = 14550
     lidar_port: int = DEFAULT_PORT
+    system_id: int = 1
+    dynamics: str = "internal"
+    vehicle: str = "iris"
     estimate: str = "nominal"
     wind_m_s: Point = (0.0, 0.0, 0.0)
     heading_rad: float = 0.0
@@ -74,12 +84,13 @@ def connect_faults(vehicle: PilotedVehicle, server: MavlinkServer, telemetry: Te
 
 def _simulation(world: World, config: GatewayConfig) -> Simulation:
     wind = WindConfig(mean_m_s=config.wind_m_s)
-    return Simulation(world, lidar=LidarConfig.device(), estimate=config.estimate, wind=wind, seed=config.seed)
+    params, dynamics = PROFILES[config.vehicle], config.dynamics
+    return Simulation(world, params, LidarConfig.device(), config.estimate, wind, config.seed, dynamics=dynamics)
 
 
-def warm_up(world: World) -> None:
+def warm_up(world: World, dynamics: str = "internal") -> None:
     """Compile or load every kernel once, on a vehicle of its own, so that no flight waits for the compiler."""
-    simulation = Simulation(world, lidar=LidarConfig.device(), hover_height_m=1.0)
+    simulation = Simulation(world, lidar=LidarConfig.device(), hover_height_m=1.0, dynamics=dynamics)
     simulation.advance(2, (0.0, 0.0, 0.0), 0.0)
     simulation.advance_motors_off(2)
     simulation.scan()
@@ -99,9 +110,9 @@ class Gateway:
         self.vehicle = PilotedVehicle(_simulation(world, config), heading_rad=config.heading_rad)
         pilot, frame = self.vehicle.autopilot, self.vehicle.frame
         self.recorder = FlightRecorder(self.vehicle.simulation, self._facts())
-        self.telemetry = Telemetry(pilot, frame, self.vehicle.snapshot, lambda: self.vehicle.time_s)
+        self.telemetry = Telemetry(pilot, frame, self.vehicle.snapshot, lambda: self.vehicle.time_s, config.system_id)
         onboard = (config.onboard_port + ONBOARD_PORT_OFFSET, config.onboard_port)
-        ground = (config.gcs_port + GROUND_PORT_OFFSET, config.gcs_port) if config.gcs_port else None
+        ground = (config.gcs_port + GROUND_PORT_OFFSET + config.system_id - 1, config.gcs_port) if config.gcs_port else None
         self.server = MavlinkServer(pilot, frame, self.telemetry, onboard, ground)
         self.incidents = connect_faults(self.vehicle, self.server, self.telemetry, config.seed)
         for fault in config.faults:
@@ -114,6 +125,7 @@ class Gateway:
         self._started_s = math.nan
         self._scans = 0
         self._was_armed = False
+        self._ended: str | None = None
         try:
             self.lidar.start()
             self.serial_lidar = SerialLidar(config.serial_lidar, config.serial_link, config.seed) if config.serial_lidar else None
@@ -140,6 +152,7 @@ class Gateway:
         world, config = self.world, self.config
         return {
             "ready": True,
+            "system_id": config.system_id,
             "onboard_port": config.onboard_port,
             "gcs_port": config.gcs_port,
             "lidar_port": self.lidar.port,
@@ -151,37 +164,27 @@ class Gateway:
         }
 
     def run(self, stop: threading.Event) -> None:
-        """Pace vehicle time to the clock until `stop` is set or `max_time_s` of vehicle time is over, then write the report."""
-        self._started_s = time.monotonic()
-        self.pace = Pace(self.config.speed, self._started_s)
-        while not stop.is_set() and self.vehicle.time_s < self.config.max_time_s:
-            behind_s = self.pace.behind_s(time.monotonic(), self.vehicle.time_s)
-            self._tell_dropped()
-            for _ in range(min(int(behind_s / STEP_S), _MAX_STEPS_PER_TURN)):
-                self.step()
-            due_s = self.pace.due_s((self.vehicle.simulation.steps + 1) * STEP_S)
-            self._wait(due_s - time.monotonic())
-        self.write_report()
+        """Pace vehicle time to the clock until `stop` is set or `max_time_s` of vehicle time is over, then write the report.
+
+        Raises `DivergedError`, after the report is written, when the vehicle can no longer be simulated.
+        """
+        run_together([self], stop)
+
+    def start(self, pace: Pace) -> None:
+        """Vehicle time begins now and follows this pace."""
+        self._started_s, self.pace = time.monotonic(), pace
 
     @property
     def device_time_s(self) -> float:
         """What the LiDARs' own clocks show: they run on while vehicle time stands still."""
         return self.vehicle.time_s + self.pace.dropped_s * self.config.speed
 
-    def _tell_dropped(self) -> None:
+    def tell_dropped(self) -> None:
+        """Warn, now and then, that vehicle time stood still."""
         dropped_s = self.pace.dropped_s
         if dropped_s - self._told_s >= _TELL_EVERY_S:
             _log.warning("this computer is too slow: vehicle time stood still for %.2f s so far", dropped_s)
             self._told_s = dropped_s
-
-    def _wait(self, seconds: float) -> None:
-        """Sleep until the next step is due; what arrives meanwhile is handled at once."""
-        if seconds <= 0.0:
-            return
-        sockets = [link.socket for link in self.server.links if isinstance(link, UdpLink)]
-        readable, _, _ = select.select(sockets, [], [], min(seconds, _LONGEST_WAIT_S))
-        if readable:
-            self.server.poll()
 
     def step(self) -> None:
         """One physics step of 4 ms with everything that hangs on it."""
@@ -207,6 +210,10 @@ class Gateway:
             self.lidar.publish(scan.time_s + ahead_s, ranges)
             self.telemetry.scan = replace(scan, ranges_m=ranges)
 
+    def give_up(self, error: DynamicsError) -> None:
+        """The vehicle can no longer be simulated: the report will say why."""
+        self._ended = str(error)
+
     def _note_changes(self) -> None:
         pilot = self.vehicle.autopilot
         while pilot.mode_changes:
@@ -225,6 +232,7 @@ class Gateway:
         elapsed_s = max(time.monotonic() - self._started_s, 1e-9)
         factor = round(self.vehicle.time_s / elapsed_s, 4)
         content = self.recorder.as_dict(real_time_factor=factor, dropped_s=round(self.pace.dropped_s, 3))
+        content["ended"] = self._ended
         content["received"] = self._received()
         content["setpoints"] = self._setpoints()
         content["faults"] = [
@@ -258,7 +266,9 @@ class Gateway:
             "world": world.name,
             "world_seed": world.seed,
             "seed": config.seed,
-            "dynamics": "internal",
+            "system_id": config.system_id,
+            "dynamics": config.dynamics,
+            "vehicle": config.vehicle,
             "estimate": config.estimate,
             "wind_m_s": list(config.wind_m_s),
             "size_m": [world.length_m, world.width_m, world.height_m],
@@ -278,3 +288,44 @@ class Gateway:
                 for mover in world.movers
             ],
         }
+
+
+def run_together(gateways: Sequence[Gateway], stop: threading.Event) -> None:
+    """Run vehicles of one world under one pace, step by step in turn, until `stop` or the first one's `max_time_s`.
+
+    Their reports are written at the end, also of a run that ends with `DivergedError`.
+    """
+    first = gateways[0]
+    pace = Pace(first.config.speed, time.monotonic())
+    for gateway in gateways:
+        gateway.start(pace)
+    try:
+        while not stop.is_set() and first.vehicle.time_s < first.config.max_time_s:
+            behind_s = pace.behind_s(time.monotonic(), first.vehicle.time_s)
+            first.tell_dropped()
+            for _ in range(min(int(behind_s / STEP_S), _MAX_STEPS_PER_TURN)):
+                step_all(gateways)
+            _wait(gateways, pace.due_s((first.vehicle.simulation.steps + 1) * STEP_S) - time.monotonic())
+    finally:
+        for gateway in gateways:
+            gateway.write_report()
+
+
+def step_all(gateways: Sequence[Gateway]) -> None:
+    """One physics step of every vehicle. Raises `DivergedError`; that vehicle's report will say so."""
+    for gateway in gateways:
+        try:
+            gateway.step()
+        except DynamicsError as error:
+            gateway.give_up(error)
+            raise
+
+
+def _wait(gateways: Sequence[Gateway], seconds: float) -> None:
+    """Sleep until the next step is due; what arrives meanwhile is handled at once."""
+    if seconds <= 0.0:
+        return
+    owners = {link.socket: gateway for gateway in gateways for link in gateway.server.links if isinstance(link, UdpLink)}
+    readable, _, _ = select.select(list(owners), [], [], min(seconds, _LONGEST_WAIT_S))
+    for gateway in {owners[sock] for sock in readable}:
+        gateway.server.poll()

@@ -12,7 +12,7 @@ from sim_gateway.flight_modes import FlightMode
 from sim_gateway.mavlink_server import MavlinkServer
 from sim_gateway.piloted import PilotedVehicle
 from sim_gateway.sticks import Sticks
-from sim_gateway.telemetry import COMPONENT_ID, SYSTEM_ID, Telemetry
+from sim_gateway.telemetry import COMPONENT_ID, Telemetry
 
 STICK_INTERVAL_S = 0.05
 ROGUE = (200, 191)  # system and component id of the other program
@@ -99,7 +99,7 @@ class Incidents:
             return
         nothing = (0.0, 0.0, 0.0)
         message = mav.MAVLink_set_position_target_local_ned_message(
-            *(round(1e3 * now_s), SYSTEM_ID, COMPONENT_ID, mav.MAV_FRAME_LOCAL_NED, _VELOCITY_AND_YAW_RATE),
+            *(round(1e3 * now_s), self._telemetry.system_id, COMPONENT_ID, mav.MAV_FRAME_LOCAL_NED, _VELOCITY_AND_YAW_RATE),
             *(*nothing, item["x_m_s"], item["y_m_s"], 0.0, *nothing, 0.0, 0.0),
         )
         message.pack(self._rogue)
@@ -107,7 +107,8 @@ class Incidents:
 
     def _rogue_mode(self, item: Active) -> None:
         params = (_CUSTOM_MODE, item["main"], item["sub"], 0.0, 0.0, 0.0, 0.0)
-        message = mav.MAVLink_command_long_message(SYSTEM_ID, COMPONENT_ID, mav.MAV_CMD_DO_SET_MODE, 0, *params)
+        target = (self._telemetry.system_id, COMPONENT_ID)
+        message = mav.MAVLink_command_long_message(*target, mav.MAV_CMD_DO_SET_MODE, 0, *params)
         message.pack(self._rogue)
         self._server.take(message)
 

@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.autopilot import StatusText
 from sim_gateway.link_faults import Garbage, LinkFaults
+from sim_gateway.mavlink_frame import FramePacker
 from sim_gateway.telemetry import COMPONENT_ID, STREAM_RATES_HZ, SYSTEM_ID, Message
 
 LOOPBACK = "127.0.0.1"
@@ -67,6 +68,7 @@ class MavlinkLink(ABC):
         self.streams = {name: _Stream(interval, 0.0) for name, interval in self._defaults.items()}
         self.parameter_queue: deque[str] = deque()
         self.gcs_heard_s = -math.inf
+        self._next_due_s = -math.inf
         self._text_id = 0
 
     @property
@@ -115,6 +117,7 @@ class MavlinkLink(ABC):
             self.streams.pop(name, None)
         else:
             self.streams[name] = _Stream(interval_s, self._now_s())
+        self._next_due_s = -math.inf
 
     def interval_us(self, name: str) -> int:
         """The interval in force; -1 when the message is not streamed."""
@@ -123,12 +126,16 @@ class MavlinkLink(ABC):
 
     def due(self, available: Callable[[str], bool]) -> list[str]:
         """Names of the messages whose time has come. A stream that fell behind skips what it missed."""
-        now_s, names = self._now_s(), []
+        names: list[str] = []
+        now_s = self._now_s()
+        if now_s < self._next_due_s - 1e-9:
+            return names
         for name, stream in self.streams.items():
             if now_s >= stream.due_s - 1e-9 and available(name):
                 names.append(name)
                 behind = now_s - stream.due_s > stream.interval_s
                 stream.due_s = now_s + stream.interval_s if behind else stream.due_s + stream.interval_s
+        self._next_due_s = min((stream.due_s for stream in self.streams.values()), default=math.inf)
         return names
 
     # ---- in
@@ -146,12 +153,14 @@ class MavlinkLink(ABC):
 class UdpLink(MavlinkLink):
     """A UDP link on loopback: to its default client port and to every loopback address that has spoken to it lately."""
 
-    def __init__(self, name: str, own_port: int, client_port: int, column: int, now_s: Callable[[], float]) -> None:
+    def __init__(
+        self, name: str, own_port: int, client_port: int, column: int, now_s: Callable[[], float], system_id: int = SYSTEM_ID
+    ) -> None:
         super().__init__(name, column, now_s)
         self.socket = _bind(own_port, f"{name} link")
         self._client = (LOOPBACK, client_port)
         self._peers: dict[tuple[str, int], float] = {}
-        self._packer = mav.MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=COMPONENT_ID)
+        self._packer = FramePacker(system_id, COMPONENT_ID)
 
     def close(self) -> None:
         """Free the port."""
@@ -160,7 +169,7 @@ class UdpLink(MavlinkLink):
     def _transmit(self, message: Message | Garbage) -> None:
         """To all peers; a full or unreachable socket loses the message, as UDP does."""
         try:
-            data = message.data if isinstance(message, Garbage) else message.pack(self._packer)
+            data = message.data if isinstance(message, Garbage) else self._packer.pack(message)
         except (struct.error, OverflowError, ValueError) as error:
             _log.error("message %s has a value outside its field: %s", type(message).__name__, error)
             return

@@ -21,7 +21,7 @@ from sim_gateway.mavlink_links import MavlinkLink, PortInUseError, UdpLink
 from sim_gateway.parameters import HASH_INDEX, HASH_NAME, UINT32, ParameterStore
 from sim_gateway.setpoints import NAN, NOTHING, SetpointRefusedError, read_setpoint
 from sim_gateway.sticks import from_manual_control
-from sim_gateway.telemetry import COMPONENT_ID, GROUND, ONBOARD, SYSTEM_ID, Message, Telemetry
+from sim_gateway.telemetry import COMPONENT_ID, GROUND, ONBOARD, Message, Telemetry
 from sim_gateway.vehicle_log import VehicleLog
 from sim_gateway.wire_log import WireLog
 
@@ -49,6 +49,7 @@ class MavlinkServer:
         """`links`: these instead of UDP on the ports."""
         self._autopilot, self._frame, self._telemetry = autopilot, frame, telemetry
         self._now = telemetry.now_s
+        self._system_id = telemetry.system_id
         self.commands = CommandHandler(autopilot, telemetry, frame)
         self.links = links if links is not None else self._udp_links(onboard_ports, ground_ports)
         self._shown_mode: tuple[FlightMode, FlightMode] | None = None
@@ -86,10 +87,10 @@ class MavlinkServer:
         }
 
     def _udp_links(self, onboard_ports: tuple[int, int], ground_ports: tuple[int, int] | None) -> list[MavlinkLink]:
-        links: list[MavlinkLink] = [UdpLink("onboard", *onboard_ports, ONBOARD, self._now)]
+        links: list[MavlinkLink] = [UdpLink("onboard", *onboard_ports, ONBOARD, self._now, self._system_id)]
         try:
             if ground_ports is not None:
-                links.append(UdpLink("ground station", *ground_ports, GROUND, self._now))
+                links.append(UdpLink("ground station", *ground_ports, GROUND, self._now, self._system_id))
         except PortInUseError:
             links[0].close()
             raise
@@ -142,7 +143,8 @@ class MavlinkServer:
         self._shown_mode, self._shown_landed = mode, landed
 
     def _dispatch(self, message: Message, link: MavlinkLink) -> None:
-        if message.get_srcSystem() == SYSTEM_ID or getattr(message, "target_system", 0) not in (0, SYSTEM_ID):
+        own = self._system_id
+        if message.get_srcSystem() == own or getattr(message, "target_system", 0) not in (0, own):
             return
         self.wire_log.note(message)
         handler = self._handlers.get(message.get_type())
@@ -153,7 +155,7 @@ class MavlinkServer:
 
     def _on_manual_control(self, m: Message, _: MavlinkLink) -> None:
         """A joystick. Its target field is a system id of its own name."""
-        sticks = from_manual_control(self._now(), m.x, m.y, m.z, m.r) if m.target in (0, SYSTEM_ID) else None
+        sticks = from_manual_control(self._now(), m.x, m.y, m.z, m.r) if m.target in (0, self._system_id) else None
         if sticks is not None:
             self._autopilot.set_sticks(sticks)
 

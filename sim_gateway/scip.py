@@ -45,6 +45,7 @@ class _Connection(asyncio.Protocol):
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _OUTPUT_LIMIT)
         self.transport = transport
         self._server.client = self
+        self._server.show_newest()
 
     def data_received(self, data: bytes) -> None:
         if self.transport is None:
@@ -82,6 +83,7 @@ class ScipServer:
         """`clock`: simulator time in s, read from the server's thread. `port` 0 takes a free one (see `port`)."""
         self.device = ScipDevice(clock, geometry)
         self.client: _Connection | None = None
+        self._newest: tuple[float, NDArray[np.floating]] | None = None
         self._wanted_port = port
         self._port: int | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -115,13 +117,18 @@ class ScipServer:
 
     def publish(self, scan_time_s: float, ranges_m: NDArray[np.floating]) -> None:
         """Hand over a full scan: `ranges_m` [steps] in m, first step (rightmost) first; see `ScipGeometry.sent_codes`."""
-        codes = self.device.geometry.sent_codes(ranges_m)
-        if self._loop is not None:
+        self._newest = (scan_time_s, ranges_m)
+        if self.client is not None and self._loop is not None:  # nobody there: not worth waking the thread
             with contextlib.suppress(RuntimeError):  # the server was stopped: nobody listens any more
-                self._loop.call_soon_threadsafe(self._deliver, scan_time_s, codes)
+                self._loop.call_soon_threadsafe(self._deliver, scan_time_s, ranges_m)
 
-    def _deliver(self, scan_time_s: float, codes: NDArray[np.int64]) -> None:
-        message = self.device.new_scan(scan_time_s, codes)
+    def show_newest(self) -> None:
+        """Let the device know the newest scan, which it was not told of while there was no client."""
+        if self._newest is not None:
+            self._deliver(*self._newest)
+
+    def _deliver(self, scan_time_s: float, ranges_m: NDArray[np.floating]) -> None:
+        message = self.device.new_scan(scan_time_s, self.device.geometry.sent_codes(ranges_m))
         if self.client is not None:
             self.client.send(message)
 

@@ -19,6 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sim_gateway.collision import clearance_m
+from sim_gateway.dynamics import CONTACTS, FLOWN, LEAST_CLEARANCE, NORMALS, Course, Demand, make_dynamics, watch_clearance
 from sim_gateway.estimate import (
     ACCELERATION_SIGMA,
     ATTITUDE_ERROR,
@@ -31,13 +32,12 @@ from sim_gateway.estimate import (
     error_coefficients,
     estimate_preset,
     initial_error,
-    step_error,
 )
 from sim_gateway.faults import Fault, FaultSchedule
 from sim_gateway.lidar import Lidar, LidarConfig
 from sim_gateway.motion_faults import MotionFaults
 from sim_gateway.scan_faults import ScanFaults
-from sim_gateway.scene import Boxes, Point, World, place_movers
+from sim_gateway.scene import Boxes, Point, World
 from sim_gateway.vehicle import (
     ACC,
     LANDED,
@@ -49,8 +49,6 @@ from sim_gateway.vehicle import (
     initial_state,
     roll_pitch_rad,
     rotation,
-    step_motors_off,
-    step_velocity,
     yaw_rad,
 )
 from sim_gateway.vehicle_params import VehicleParams
@@ -58,12 +56,8 @@ from sim_gateway.vehicle_params import VehicleParams
 Array = NDArray[np.float64]
 
 MAX_STEPS_PER_CALL = 250 * 3600
-_NORMALS = PROCESSES + 3  # one step's draws: estimate errors, then gusts
 _SCAN_STREAM, _ACCELERATION_STREAM = 0, 1
 _NO_ERROR, _NO_NOISE = np.zeros(ERROR_SIZE), np.zeros(3)
-
-# running log of the kernel
-_LEAST_CLEARANCE, _TOUCHING, _CONTACTS, _FLOWN = 0, 1, 2, 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,40 +103,6 @@ class Scan:
     angle_increment_rad: float
     range_min_m: float
     range_max_m: float
-
-
-@njit(cache=True)
-def _watch_clearance(boxes: Array, state: Array, radius: float, log: Array) -> None:
-    """Keep the least clearance, and count a contact whenever clearance falls below zero."""
-    clearance = clearance_m(boxes, state[POS : POS + 3], radius)
-    log[_LEAST_CLEARANCE] = min(log[_LEAST_CLEARANCE], clearance)
-    touching = 1.0 if clearance < 0.0 else 0.0
-    if touching > log[_TOUCHING]:
-        log[_CONTACTS] += 1.0
-    log[_TOUCHING] = touching
-
-
-@njit(cache=True)
-def _advance(  # type: ignore[no-untyped-def]
-    state, params, velocity_sp, yaw_rate_sp, motors_on, normals, first_step,
-    boxes, fixed, movers, error, coefficients, wind_mean, gust, gust_coefficients, radius, log,
-):  # fmt: skip
-    """`normals.shape[0]` steps of 4 ms: wind, estimate errors, vehicle, movers, then clearance and contacts into `log`."""
-    wind = np.empty(3)
-    for step in range(normals.shape[0]):
-        for i in range(3):
-            gust[i] = gust_coefficients[0] * gust[i] + gust_coefficients[1] * normals[step, PROCESSES + i]
-            wind[i] = wind_mean[i] + gust[i]
-        step_error(error, coefficients, normals[step])
-        x, y, z = state[POS], state[POS + 1], state[POS + 2]
-        if motors_on:
-            step_velocity(state, params, velocity_sp, yaw_rate_sp, wind, error[VELOCITY_ERROR : VELOCITY_ERROR + 3], 1)
-        else:
-            step_motors_off(state, params, wind, 1)
-        dx, dy, dz = state[POS] - x, state[POS + 1] - y, state[POS + 2] - z
-        log[_FLOWN] += math.sqrt(dx * dx + dy * dy + dz * dz)
-        place_movers(movers, movers.shape[0], (first_step + step + 1) * STEP_S, boxes[fixed:])
-        _watch_clearance(boxes, state, radius, log)
 
 
 @njit(cache=True)
@@ -196,6 +156,7 @@ class Simulation:
         seed: of everything random here (the world has its own).
         hover_height_m: None starts on the ground with motors off; a number starts hovering there above the start.
         contact_radius_m: radius of the sphere whose distance to boxes is the clearance.
+        dynamics: what moves the airframe, a name of `dynamics.DYNAMICS`. Raises `DynamicsMissingError` if it is not installed.
     """
 
     def __init__(
@@ -209,6 +170,7 @@ class Simulation:
         *,
         hover_height_m: float | None = None,
         contact_radius_m: float = 0.35,
+        dynamics: str = "internal",
     ) -> None:
         params, wind = params or VehicleParams(), wind or WindConfig()
         self.world, self.seed, self.steps, self.contact_radius_m = world, seed, 0, contact_radius_m
@@ -227,7 +189,12 @@ class Simulation:
         self.motion_faults = MotionFaults(self.faults)
         self._scan_faults = ScanFaults(self.faults, seed)
         self._log = np.array([math.inf, 0.0, 0.0, 0.0])
-        _watch_clearance(self._boxes, self._state, contact_radius_m, self._log)
+        watch_clearance(self._boxes, self._state, contact_radius_m, self._log)
+        self._dynamics = make_dynamics(dynamics, params)
+        self._course = Course(
+            *(self._state, self._boxes, len(world.static_boxes), world.mover_rows, self._error, self._coefficients),
+            *(self._gust, self._gust_coefficients, contact_radius_m, self._log),
+        )
 
     def _start_errors(self, noise: EstimateNoise) -> None:
         row = noise.as_array()
@@ -256,10 +223,11 @@ class Simulation:
     def advance(self, n_steps: int, velocity_sp: Sequence[float] | Array, yaw_rate_sp: float) -> None:
         """Fly `n_steps` of 4 ms under a velocity setpoint (world, m/s) and yaw rate (rad/s, counter-clockwise).
 
-        Raises `ValueError` if a setpoint is not finite or `n_steps` is negative or absurdly large.
+        Raises `ValueError` if a setpoint is not finite or `n_steps` is negative or absurdly large, and `DivergedError`
+        when the vehicle's state is no longer finite.
         """
         setpoint = np.array(velocity_sp, dtype=np.float64)
-        if setpoint.shape != (3,) or not np.isfinite(setpoint).all() or not math.isfinite(yaw_rate_sp):
+        if setpoint.shape != (3,) or not all(map(math.isfinite, (*setpoint.tolist(), yaw_rate_sp))):
             raise ValueError(f"setpoint {velocity_sp}, {yaw_rate_sp}: give three finite velocities and a finite yaw rate")
         self._step(n_steps, setpoint, float(yaw_rate_sp), motors_on=True)
 
@@ -269,6 +237,7 @@ class Simulation:
         state[POS : POS + 3], state[VEL : VEL + 3] = position_m, velocity_m_s
         state[QUAT : QUAT + 4] = (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
         state[OMEGA : OMEGA + 3] = 0.0
+        self._dynamics.moved()
 
     def disturb(self, position_m: Sequence[float], velocity_m_s: Sequence[float], wind_m_s: Sequence[float]) -> None:
         """Put the estimate's errors and the steady wind where an adversary wants them (corridor frame), from the next step on.
@@ -298,13 +267,9 @@ class Simulation:
     def _step_alike(
         self, n_steps: int, setpoint: Array, yaw_rate_sp: float, params: Array, wind_mean: Array, *, motors_on: bool
     ) -> None:
-        normals = self._generator.standard_normal((n_steps, _NORMALS))
-        _advance(
-            *(self._state, params, setpoint, yaw_rate_sp, motors_on, normals, self.steps),
-            *(self._boxes, len(self.world.static_boxes), self.world.mover_rows),
-            *(self._error, self._coefficients, wind_mean, self._gust, self._gust_coefficients),
-            *(self.contact_radius_m, self._log),
-        )
+        normals = self._generator.standard_normal((n_steps, NORMALS))
+        demand = Demand(params, setpoint, yaw_rate_sp, motors_on, wind_mean)
+        self._dynamics.advance(self._course, demand, normals, self.steps)
         self.steps += n_steps
 
     # motion
@@ -384,17 +349,17 @@ class Simulation:
     @property
     def min_clearance_m(self) -> float:
         """The least `clearance_m` so far, at 250 Hz."""
-        return float(self._log[_LEAST_CLEARANCE])
+        return float(self._log[LEAST_CLEARANCE])
 
     @property
     def contacts(self) -> int:
         """How many times the clearance has fallen below zero (a start inside a box counts as one)."""
-        return int(self._log[_CONTACTS])
+        return int(self._log[CONTACTS])
 
     @property
     def flown_m(self) -> float:
         """Length of the true path so far, at 250 Hz."""
-        return float(self._log[_FLOWN])
+        return float(self._log[FLOWN])
 
 
 def _triple(values: Array) -> Point:

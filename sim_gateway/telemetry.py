@@ -125,9 +125,14 @@ class Telemetry:
     """
 
     def __init__(
-        self, autopilot: Autopilot, frame: LocalFrame, snapshot: Callable[[], Snapshot], now_s: Callable[[], float]
+        self,
+        autopilot: Autopilot,
+        frame: LocalFrame,
+        snapshot: Callable[[], Snapshot],
+        now_s: Callable[[], float],
+        system_id: int = SYSTEM_ID,
     ) -> None:
-        self.now_s = now_s
+        self.now_s, self.system_id = now_s, system_id
         self._autopilot = autopilot
         self._frame = frame
         self._snapshot = snapshot
@@ -218,7 +223,7 @@ class Telemetry:
 
     def _autopilot_version(self, _: Snapshot) -> Message:
         zeros = [0] * 8
-        return mav.MAVLink_autopilot_version_message(59647, 17891328, 17891328, 0, 1, zeros, zeros, zeros, 0, 0, SYSTEM_ID)
+        return mav.MAVLink_autopilot_version_message(59647, 17891328, 17891328, 0, 1, zeros, zeros, zeros, 0, 0, self.system_id)
 
     def _mission_current(self, _: Snapshot) -> Message:
         mission, flying = self._autopilot.mission, self._autopilot.mode is FlightMode.MISSION

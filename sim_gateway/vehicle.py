@@ -98,12 +98,7 @@ def step_velocity(
     """
     motor_gain = 1.0 - math.exp(-STEP_S / params[vp.MOTOR_LAG])
     for _ in range(n_steps):
-        if state[PHASE] <= 0.0:
-            _velocity_loop(state, params, velocity_sp, estimate_error)
-            state[PHASE] = _OUTER_STEPS
-        state[PHASE] -= 1.0
-        roll, pitch, yaw = _attitude_and_rate_loops(state, params, yaw_rate_sp)
-        _drive_motors(state, motor_gain, state[THRUST_SP], roll, pitch, yaw)
+        _cascade(state, params, velocity_sp, yaw_rate_sp, estimate_error, motor_gain)
         _rigid_body(state, params, wind)
 
 
@@ -113,9 +108,19 @@ def step_motors_off(state: Row, params: Row, wind: Row, n_steps: int) -> None:
     motor_gain = 1.0 - math.exp(-STEP_S / params[vp.MOTOR_LAG])
     _reset_controller(state)
     for _ in range(n_steps):
-        for i in range(4):
-            state[MOTOR + i] -= motor_gain * state[MOTOR + i]
+        _run_down(state, motor_gain)
         _rigid_body(state, params, wind)
+
+
+@njit(cache=True, error_model="numpy")
+def drive_motors(state: Row, params: Row, velocity_sp: Row, yaw_rate_sp: float, estimate_error: Row, motors_on: bool) -> None:
+    """One step of the cascade and of the motors alone, in place: for dynamics that move the airframe by themselves."""
+    motor_gain = 1.0 - math.exp(-STEP_S / params[vp.MOTOR_LAG])
+    if motors_on:
+        _cascade(state, params, velocity_sp, yaw_rate_sp, estimate_error, motor_gain)
+    else:
+        _reset_controller(state)
+        _run_down(state, motor_gain)
 
 
 @njit(cache=True)
@@ -266,7 +271,24 @@ def _rate_pid(state: Row, axis: int, rate_sp: float, p_gain: float, i_gain: floa
 
 
 @njit(cache=True, error_model="numpy")
-def _drive_motors(state: Row, motor_gain: float, thrust: float, roll: float, pitch: float, yaw: float) -> None:
+def _cascade(state: Row, params: Row, velocity_sp: Row, yaw_rate_sp: float, estimate_error: Row, motor_gain: float) -> None:
+    """From the velocity setpoint to the motors' thrust, one step of 4 ms."""
+    if state[PHASE] <= 0.0:
+        _velocity_loop(state, params, velocity_sp, estimate_error)
+        state[PHASE] = _OUTER_STEPS
+    state[PHASE] -= 1.0
+    roll, pitch, yaw = _attitude_and_rate_loops(state, params, yaw_rate_sp)
+    _mix(state, motor_gain, state[THRUST_SP], roll, pitch, yaw)
+
+
+@njit(cache=True)
+def _run_down(state: Row, motor_gain: float) -> None:
+    for i in range(4):
+        state[MOTOR + i] -= motor_gain * state[MOTOR + i]
+
+
+@njit(cache=True, error_model="numpy")
+def _mix(state: Row, motor_gain: float, thrust: float, roll: float, pitch: float, yaw: float) -> None:
     """Quad X mixer without airmode, then motor lag. Yaw gives way first; then the collective is lowered, then roll and pitch."""
     roll, pitch = _ROLL_PITCH_MIX * roll, _ROLL_PITCH_MIX * pitch
     spread = abs(roll) + abs(pitch)  # of the four motors: some are up and some down by exactly this
@@ -318,7 +340,7 @@ def _rigid_body(state: Row, params: Row, wind: Row) -> None:
         params[vp.YAW_MOMENT] * (t2 + t3 - t0 - t1),
     )
     if state[POS + 2] <= 0.0 and state[VEL + 2] <= 0.0:
-        _touch_down(state)
+        touch_down(state)
 
 
 @njit(cache=True, error_model="numpy")
@@ -342,7 +364,7 @@ def _rotate(state: Row, params: Row, torque_x: float, torque_y: float, torque_z:
 
 
 @njit(cache=True)
-def _touch_down(state: Row) -> None:
+def touch_down(state: Row) -> None:
     """Come to rest level on the ground, heading kept: no bouncing, no sliding."""
     heading = yaw_rad(state)
     state[POS + 2] = 0.0
