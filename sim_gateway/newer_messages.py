@@ -48,22 +48,28 @@ class NewerMessage(mav.MAVLink_message):  # type: ignore[misc]
     msgname: ClassVar[str]
     definition: ClassVar[str]
 
+    def __init_subclass__(cls) -> None:
+        """What pymavlink's generator writes into each message: layout on the wire and the byte against other definitions."""
+        fields = _fields(cls.definition)
+        wire = _on_the_wire(fields)
+        cls.fieldnames = [name for _, name, _ in fields]
+        cls.ordered_fieldnames = [name for _, name, _ in wire]
+        cls.array_lengths = [length for _, _, length in wire]
+        cls.unpacker = struct.Struct("<" + "".join(f"{length or ''}{_CODES[kind]}" for kind, _, length in wire))
+        cls.crc_extra = crc_extra(cls.msgname, fields)
+
     def __init__(self, **values: Any) -> None:
         super().__init__(self.id, self.msgname)
-        self._defined = _fields(self.definition)
-        self._fieldnames = [name for _, name, _ in self._defined]
+        self._fieldnames = self.fieldnames
         self._instance_field, self._instance_offset = None, -1
-        for name in self._fieldnames:
+        for name in self.fieldnames:
             setattr(self, name, values[name])
 
     def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
         """The frame."""
-        wire = _on_the_wire(self._defined)
-        layout = "<" + "".join(f"{length or ''}{_CODES[kind]}" for kind, _, length in wire)
-        values = [getattr(self, name) for _, name, _ in wire]
+        values = [getattr(self, name) for name in self.ordered_fieldnames]
         flat = [item for value in values for item in (value if isinstance(value, list) else [value])]
-        data = struct.pack(layout, *flat)
-        return bytes(self._pack(mav, crc_extra(self.msgname, self._defined), data, force_mavlink1=force_mavlink1))
+        return bytes(self._pack(mav, self.crc_extra, self.unpacker.pack(*flat), force_mavlink1=force_mavlink1))
 
 
 class LinkNodeStatus(NewerMessage):
