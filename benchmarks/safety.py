@@ -58,11 +58,12 @@ Tick = tuple[VelocityCommand, VehicleState, LidarScan | None, float]
 def _tick(case: str, k: int, ranges: np.ndarray) -> Tick:
     """The inputs of one tick of a flight along a corridor; `intervening` stands before a wall."""
     now, blocked = 0.05 * k, case == "intervening"
-    place = CorridorVector(1.0 if blocked else 1.0 + 0.05 * k, 0.5, 2.0)
-    velocity = CorridorVector(0.0 if blocked else 1.0, 0.0, 0.0)
+    wobble = 0.002 * math.sin(0.7 * k)  # an estimate that never changes is a fault
+    place = CorridorVector(1.0 if blocked else 1.0 + 0.05 * k, 0.5 + wobble, 2.0 + wobble)
+    velocity = CorridorVector(0.0 if blocked else 1.0, wobble, wobble)
     scan = None if case == "fault" else LidarScan(now, ranges, -math.pi / 2, math.pi / BEAMS, 0.1, 4.0)
     wanted = VelocityCommand(CorridorVector(1.0, 0.3 if blocked else 0.0, 0.0), 0.1)
-    return wanted, VehicleState(now, place, velocity, ZERO, 0.02, 0.03, 0.0, 0.0), scan, now
+    return wanted, VehicleState(now, place, velocity, ZERO, 0.02 + wobble, 0.03, 0.0, 0.0), scan, now
 
 
 def _ticks(case: str) -> list[Tick]:

@@ -34,7 +34,7 @@ def polygons(inclusion=L_SHAPE, exclusion=(PILLAR,), low=0.3, high=4.0) -> Fence
 def sent_in(fence, place, v=(0.0, 0.0), wanted=(0.0, 0.0), yaw=0.0, **changes):
     safety = SafetyFilter(SafetyConfig(fence=fence, **(FREE | changes)))
     pose = state(place[0], place[1], v=(*v, 0.0), yaw=yaw)
-    sent, verdict = safety.apply(command(*wanted), pose, scan(), 0.0)
+    sent, verdict = safety.apply(command(*wanted), pose, scan(beams=360, fov=2.0 * math.pi), 0.0)
     return np.array(dataclasses.astuple(sent.velocity)[:2]), verdict
 
 
