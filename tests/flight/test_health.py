@@ -142,7 +142,7 @@ class TroubledLoop:
     def reset(self) -> None:
         self.pilot.reset()
 
-    def tick(self, scan, state, now_s: float):  # type: ignore[no-untyped-def]
+    def tick(self, scan, state, now_s: float, _health=None):  # type: ignore[no-untyped-def]
         late, delay = float(self.random.exponential(0.012)), float(self.random.uniform(0.0, 0.3))
         step = float(self.random.exponential(0.012))
         health = Health(late, delay, in_control=True, boots=0, inference_s=step, overruled=bool(self.random.random() < 0.05))

@@ -160,5 +160,5 @@ def test_require_names_the_first_failed_check() -> None:
 def test_the_example_with_polygons_is_valid_and_its_fence_is_kept() -> None:
     safety = load_mission(ROOT / "configs" / "polygon_fence.yaml").safety
     assert goal_problem(CorridorVector(20.0, 2.0, 2.0), safety) is None
-    assert "outside the safe part of the fence by 0.24 m" in str(goal_problem(CorridorVector(20.0, 3.0, 2.0), safety))
+    assert "outside the safe part of the fence by 0.28 m" in str(goal_problem(CorridorVector(20.0, 3.0, 2.0), safety))
     assert "outside" in str(takeoff_point_problem((12.0, -3.5), safety))

@@ -41,6 +41,7 @@ class Flight:
     def __init__(self, policy, simulation: Simulation, ticks: int, config: SafetyConfig | None = None):
         safety, self.simulation = SafetyFilter(config or SafetyConfig(fence=FENCE)), simulation
         self.out, self.faults, self.speed = -math.inf, set(), 0.0
+        begin = simulation.steps
         low, high = safety.config.fence.min_m, safety.config.fence.max_m
         for k in range(ticks):
             wanted = policy(k, simulation)
@@ -48,7 +49,7 @@ class Flight:
             sent, verdict = safety.apply(wanted, state_of(simulation.estimate()), scan_of(simulation.scan()), now)
             self.faults.add(verdict.fault)
             velocity = (sent.velocity.x, sent.velocity.y, sent.velocity.z)
-            simulation.advance(step_at((k + 1) * 0.05) - simulation.steps, velocity, sent.yaw_rate_rad_s)
+            simulation.advance(begin + step_at((k + 1) * 0.05) - simulation.steps, velocity, sent.yaw_rate_rad_s)
             place, hull = simulation.truth.position_m, (0.35, 0.35, 0.1)
             self.out = max(self.out, *(max(low[i] + hull[i] - place[i], place[i] + hull[i] - high[i]) for i in range(3)))
             self.speed = max(self.speed, math.hypot(sent.velocity.x, sent.velocity.y))

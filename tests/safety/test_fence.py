@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
-from safety_plant import command, scan, state
+from safety_plant import command, config, scan, state
 
 from safety.config import Fence, SafetyConfig
 from safety.fence import PolygonFence, signed_area_m2
@@ -24,6 +24,7 @@ SQUARE = ((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0))
 quick = settings(max_examples=60, deadline=None)
 inside_l = st.tuples(st.floats(0.3, 11.7), st.floats(0.3, 11.7)).filter(lambda p: p[0] < 4.7 or p[1] < 4.7)
 velocity = st.tuples(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2))
+SLACK_M = config().position_error_m + config().drift_m + config().margin_m
 FREE = {"max_acceleration_m_s2": 1000.0, "max_jerk_m_s3": 1000.0, "ground_z_m": -100.0}
 
 
@@ -236,7 +237,7 @@ def test_it_slides_along_a_slanted_wall(along, v):
     """Half into a wall at 45 degrees: what leads along it stays."""
     diamond = ((0.0, -9.0), (9.0, 0.0), (0.0, 9.0), (-9.0, 0.0))
     out, side = np.array((1.0, 1.0)) / math.sqrt(2.0), np.array((-1.0, 1.0)) / math.sqrt(2.0)
-    place = out * (9.0 / math.sqrt(2.0) - 0.35 - 0.09 * math.sqrt(2.0) - 0.001)
+    place = out * (9.0 / math.sqrt(2.0) - 0.35 - SLACK_M * math.sqrt(2.0) - 0.001)
     sent, verdict = sent_in(polygons(diamond, ()), place, v * side, along * side + 0.5 * out, yaw=math.atan2(*side[::-1]))
     assert sent @ side > 0.9 * along
     assert sent @ out < 0.05
@@ -248,7 +249,7 @@ def test_it_slides_along_a_slanted_wall(along, v):
 def test_from_a_margin_only_the_way_back_is_open(depth, heading):
     """Inside the margin of the reflex corner: no part of any command leads towards it, and away from it is open."""
     corner, away = np.array((5.0, 5.0)), -np.array((math.cos(math.pi / 4), math.sin(math.pi / 4)))
-    place = corner + away * (0.35 + 0.09 * math.sqrt(2.0) - depth)
+    place = corner + away * (0.35 + SLACK_M * math.sqrt(2.0) - depth)
     sent, verdict = sent_in(polygons(exclusion=()), place, wanted=(math.cos(heading), math.sin(heading)), yaw=heading)
     assert sent @ away >= -1e-9
     assert verdict.fence_margin_m == pytest.approx(-depth)
@@ -272,7 +273,7 @@ def test_from_a_forbidden_place_no_command_leads_further_in(place, heading):
 def test_there_is_a_way_out_of_an_exclusion():
     sent, verdict = sent_in(polygons(), (2.1, 8.5), wanted=(-0.3, 0.0), yaw=math.pi)
     assert sent[0] < -0.2
-    assert verdict.fence_margin_m == pytest.approx(-0.1 - 0.44)
+    assert verdict.fence_margin_m == pytest.approx(-0.1 - 0.35 - SLACK_M)
 
 
 def test_no_leg_goes_through_a_thin_exclusion():
