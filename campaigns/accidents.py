@@ -24,7 +24,7 @@ for _name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 from pydantic import BaseModel, ConfigDict
 
 from campaigns.mutation.forks import Answer, Job, run_forked
-from campaigns.mutation.hotswap import preload, swap, unaffected
+from campaigns.mutation.hotswap import forget, preload, swap
 from campaigns.mutation.mutants import sources
 from campaigns.mutation.probe import fixed_examples, function_of, run_tests
 from campaigns.mutation.suite import SLOW
@@ -109,9 +109,10 @@ def happen(root: Path, accidents: list[Accident], tests: dict[str, list[str]], a
     texts = sources(root)
     changed = {accident.name: accident.applied(texts[accident.file]) for accident in accidents}
     fixed_examples()
-    preload(["numpy.testing", *unaffected(texts, {accident.file for accident in accidents})])
+    preload(["numpy.testing", "pydantic"])
 
     def look(accident: Accident) -> Answer:
+        forget(root)
         swap(root, {accident.file: changed[accident.name]})
         order = tests[accident.name]
         probe = run_tests(root, list(dict.fromkeys(name.partition("::")[0] for name in order)), order, LEAST_TESTS)
