@@ -13,9 +13,11 @@ from safety_plant import command, config, scan, state
 from safety.braking import Start, tubes
 from safety.config import Fence, braking_distance_m
 from safety.fence import PolygonFence, polygon_fence, signed_area_m2
-from safety.filter import SafetyFilter
+from safety.filter import SafetyFilter, gate_problem
 from safety.frames import CorridorFrame, CorridorVector, NedVector
 from safety.limits import AT_REST, LastSent, limit_command, sent_after
+from safety.messages import SafeCommand, VelocityCommand
+from safety.shield import Decision
 
 
 def test_frames_can_be_asked_through_an_object_too():
@@ -195,3 +197,26 @@ def test_after_a_pause_the_command_grows_as_after_two_ticks():
     safety.apply(command(), state(), scan(), 0.0)
     sent, _ = safety.apply(command(0.9), state(time_s=0.24), scan(time_s=0.24), 0.24)
     assert sent.velocity.x == pytest.approx(0.2)
+
+
+def gate(x=0.0, y=0.0, z=0.0, rate=0.0):
+    found = gate_problem(SafeCommand(CorridorVector(x, y, z), rate), config())
+    return None if found is None else found.rule
+
+
+def test_the_gate_is_exact_for_each_number_and_for_the_vector():
+    slack = 1.0 + 1e-9
+    assert gate(x=1.2 * slack) == gate(z=0.5 * slack) == gate(z=-0.5 * slack) == gate(rate=-slack) is None
+    assert gate(x=1.2 * slack**2) == gate(z=0.5 * slack**2) == gate(z=-0.5 * slack**2) == gate(rate=-(slack**2)) == "gate_limit"
+    assert gate(x=0.9, y=-0.9) == "gate_limit"
+    assert {gate(**{name: value}) for name in ("x", "y", "z", "rate") for value in (math.nan, math.inf)} == {"gate_not_finite"}
+
+
+@pytest.mark.parametrize("bad", [(math.nan, 0.0, 0.0), (0.0, 0.0, 0.6), (0.9, 0.9, 0.0)])
+def test_what_a_stage_lets_through_ends_at_the_gate(monkeypatch, bad):
+    wrong = VelocityCommand(CorridorVector(*bad), 0.0)
+    monkeypatch.setattr("safety.filter.limit_command", lambda *_: (wrong, ()))
+    monkeypatch.setattr("safety.shield.Shield.choose", lambda _self, wanted, *_: Decision(wanted, (), 1.0, 1.0))
+    sent, verdict = SafetyFilter(config()).apply(command(0.1), state(), scan(), 0.0)
+    assert sent.velocity == CorridorVector(0.0, 0.0, 0.0)
+    assert verdict.fault in {"gate_not_finite", "gate_limit"}
