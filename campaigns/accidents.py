@@ -24,7 +24,7 @@ for _name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 from pydantic import BaseModel, ConfigDict
 
 from campaigns.mutation.forks import Answer, Job, run_forked
-from campaigns.mutation.hotswap import preload, swap, unaffected
+from campaigns.mutation.hotswap import forget, preload, swap
 from campaigns.mutation.mutants import sources
 from campaigns.mutation.probe import fixed_examples, function_of, run_tests
 from campaigns.mutation.suite import SLOW
@@ -109,9 +109,10 @@ def happen(root: Path, accidents: list[Accident], tests: dict[str, list[str]], a
     texts = sources(root)
     changed = {accident.name: accident.applied(texts[accident.file]) for accident in accidents}
     fixed_examples()
-    preload(["numpy.testing", *unaffected(texts, {accident.file for accident in accidents})])
+    preload(["numpy.testing", "pydantic"])
 
     def look(accident: Accident) -> Answer:
+        forget(root)
         swap(root, {accident.file: changed[accident.name]})
         order = tests[accident.name]
         probe = run_tests(root, list(dict.fromkeys(name.partition("::")[0] for name in order)), order, LEAST_TESTS)
@@ -144,6 +145,10 @@ def options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m campaigns.accidents", description=(__doc__ or "").split("\n", maxsplit=1)[0])
     parser.add_argument("--out", type=Path, help="write the result to this JSON file")
     parser.add_argument("--only", action="append", help="only accidents with this text in their name; may be repeated")
+    parser.add_argument(
+        "--ignore", action="append", default=[], help="leave out tests with this text in their name (unsteady ones)"
+    )
+    parser.add_argument("--missing", action="store_true", help="only what the file at --out does not show as noticed; it is kept")
     parser.add_argument("--again", type=Path, help="an earlier result: run only the tests that noticed each accident then")
     parser.add_argument("--handful", type=int, help="only so many, every day others")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="accidents at a time")
@@ -157,10 +162,19 @@ def handful(accidents: list[Accident], count: int, day: int) -> list[Accident]:
     return (accidents * 2)[first : first + min(count, len(accidents))]
 
 
+def _noticed(path: Path, ignore: list[str]) -> dict[str, list[str]]:
+    """Accidents of an earlier result that enough tests noticed, those to be ignored not counted."""
+    seen = recorded(path) if path.exists() else {}
+    left = {name: [one for one in tests if not any(text in one for text in ignore)] for name, tests in seen.items()}
+    return {name: tests for name, tests in left.items() if len(set(map(function_of, tests))) >= LEAST_TESTS}
+
+
 def main() -> int:
     """Let accidents happen; 0 when each was noticed by enough tests."""
     chosen, root = options(), Path.cwd()
     accidents = [one for one in load_accidents() if not chosen.only or any(text in one.name for text in chosen.only)]
+    kept = _noticed(chosen.out, chosen.ignore) if chosen.missing and chosen.out else {}
+    accidents = [one for one in accidents if one.name not in kept]
     if chosen.handful:
         accidents = handful(accidents, chosen.handful, date.today().toordinal())
     if chosen.again:
@@ -173,7 +187,8 @@ def main() -> int:
         print(f"fail without any change, and judge nothing: {', '.join(known.broken) or 'none'}", flush=True)
         preload(known.modules)
         tests = orders(root, accidents, known)
-    outcomes = []
+        tests = {name: [one for one in order if not any(text in one for text in chosen.ignore)] for name, order in tests.items()}
+    outcomes = [Outcome(one, kept[one.name], "") for one in load_accidents() if one.name in kept]
     for outcome in happen(root, accidents, tests, chosen.jobs):
         outcomes.append(outcome)
         who = ", ".join(outcome.tests) or outcome.problem or "nobody"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import importlib
 import importlib.abc
@@ -67,26 +66,3 @@ def preload(names: Iterable[str]) -> None:
     for name in names:
         with contextlib.suppress(ImportError):  # made by its package only (vendored): the child imports it as the test does
             importlib.import_module(name)
-
-
-def unaffected(sources: dict[str, str], changed: set[str]) -> list[str]:
-    """Names of the modules that import, directly or not, none of the changed files: these may be imported beforehand."""
-    names = {module_name(path): path for path in sources}
-    uses = {name: {other for other in _imports(sources[path]) if other in names} for name, path in names.items()}
-    touched = {module_name(path) for path in changed}
-    while True:
-        more = {name for name, used in uses.items() if name not in touched and used & touched}
-        if not more:
-            return sorted(set(names) - touched)
-        touched |= more
-
-
-def _imports(source: str) -> set[str]:
-    """Every module name that a source may import, packages on the way included."""
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return found | {name.rpartition(".")[0] for name in found}

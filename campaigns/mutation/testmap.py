@@ -18,7 +18,6 @@ from campaigns.mutation.mutants import definitions, sources
 from campaigns.mutation.probe import fixed_examples, run_tests
 from campaigns.mutation.suite import TESTS
 
-OWN = ("safety", "campaigns", "flight", "training", "policy_export", "tests", "test_", "safety_", "conftest", "__main__")
 RECORD_CPU_S = 900.0
 Lines = dict[str, dict[int, list[str]]]  # file -> line -> tests that ran it; "" = while importing
 
@@ -68,12 +67,19 @@ def _record(root: Path, file: str) -> Answer:
         }
         for name in data.measured_files()
     }
-    return {"seconds": probe.seconds, "failed": probe.failed, "lines": lines, "modules": sorted(_foreign())}
+    return {
+        "seconds": probe.seconds,
+        "failed": probe.failed,
+        "lines": lines,
+        "modules": sorted(set(_foreign(root)) - {"__main__"}),
+    }
 
 
-def _foreign() -> Iterator[str]:
+def _foreign(root: Path) -> Iterator[str]:
+    """Names of imported modules that lie elsewhere."""
     for name, module in list(sys.modules.items()):
-        if module is not None and getattr(module, "__spec__", None) is not None and not name.startswith(OWN):
+        file = getattr(module, "__file__", None)
+        if getattr(module, "__spec__", None) is not None and (file is None or not Path(file).is_relative_to(root)):
             yield name
 
 

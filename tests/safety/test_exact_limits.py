@@ -8,13 +8,16 @@ import random
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from safety_plant import command, config
+from safety_plant import command, config, scan, state
 
 from safety.braking import Start, tubes
 from safety.config import Fence, braking_distance_m
 from safety.fence import PolygonFence, polygon_fence, signed_area_m2
+from safety.filter import SafetyFilter, gate_problem
 from safety.frames import CorridorFrame, CorridorVector, NedVector
 from safety.limits import AT_REST, LastSent, limit_command, sent_after
+from safety.messages import SafeCommand, VelocityCommand
+from safety.shield import Decision
 
 
 def test_frames_can_be_asked_through_an_object_too():
@@ -140,3 +143,80 @@ def test_a_figure_of_eight_is_no_fence():
     eight = ((0.0, 0.0), (20.0, 10.0), (20.0, 0.0), (0.0, 6.0))
     with pytest.raises(ValidationError, match="crosses"):
         Fence(floor_m=0.0, ceiling_m=4.0, inclusion=eight)
+
+
+def test_yaw_is_told_within_half_a_turn():
+    frame = CorridorFrame(NedVector(0.0, 0.0, 0.0), 3.0)
+    assert frame.yaw_to_ned(-3.0) == pytest.approx(6.0 - 2.0 * math.pi)
+    assert frame.yaw_to_corridor(-3.0) == pytest.approx(6.0 - 2.0 * math.pi)
+
+
+@pytest.mark.parametrize("heading", [-3.1, 0.0, 3.1])
+@pytest.mark.parametrize("yaw", [-9.0, -3.1, 0.2, 3.1, 9.0])
+def test_yaw_there_and_back_is_the_same_direction(heading, yaw):
+    frame = CorridorFrame(NedVector(0.0, 0.0, 0.0), heading)
+    assert abs(frame.yaw_to_ned(yaw)) <= math.pi
+    assert math.remainder(frame.yaw_to_corridor(frame.yaw_to_ned(yaw)) - yaw, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-9)
+
+
+def flown(**changes):
+    """A filter that has flown forward for a while, and its time."""
+    safety = SafetyFilter(config(**changes))
+    for k in range(6):
+        safety.apply(command(0.2), state(time_s=0.05 * k), scan(time_s=0.05 * k), 0.05 * k)
+    return safety, 0.3
+
+
+def test_nothing_is_in_flight_after_reset():
+    safety, now = flown()
+    assert safety._history.newest().x == 0.2
+    safety.reset()
+    before = CorridorVector(0.1, 0.0, 0.0)
+    assert [part[1] for part in safety._history.phases(now - 0.2, now, before)] == [before]
+
+
+def test_commands_of_another_flight_shorten_nothing():
+    """Just after reset the filter decides as a new one does, at the same times."""
+    used, now = flown()
+    used.reset()
+    wall = np.where(np.abs(np.arange(180) - 89.5) < 20, 1.35, np.inf)
+    pose, seen = state(v=(0.4, 0.0, 0.0), time_s=now), scan(wall, now)
+    sent, verdict = used.apply(command(0.5), pose, seen, now)
+    fresh, wanted = SafetyFilter(config()).apply(command(0.5), pose, seen, now)
+    assert (sent, repr(verdict)) == (fresh, repr(wanted))
+
+
+def test_a_pause_counts_as_two_ticks_at_most():
+    safety, now = flown()
+    assert safety._dt_s(now) == pytest.approx(0.05)
+    assert safety._dt_s(now + 60.0) == 0.1
+
+
+def test_after_a_pause_the_command_grows_as_after_two_ticks():
+    safety = SafetyFilter(config(max_acceleration_m_s2=2.0, max_jerk_m_s3=1000.0))
+    safety.apply(command(), state(), scan(), 0.0)
+    sent, _ = safety.apply(command(0.9), state(time_s=0.24), scan(time_s=0.24), 0.24)
+    assert sent.velocity.x == pytest.approx(0.2)
+
+
+def gate(x=0.0, y=0.0, z=0.0, rate=0.0):
+    found = gate_problem(SafeCommand(CorridorVector(x, y, z), rate), config())
+    return None if found is None else found.rule
+
+
+def test_the_gate_is_exact_for_each_number_and_for_the_vector():
+    slack = 1.0 + 1e-9
+    assert gate(x=1.2 * slack) == gate(z=0.5 * slack) == gate(z=-0.5 * slack) == gate(rate=-slack) is None
+    assert gate(x=1.2 * slack**2) == gate(z=0.5 * slack**2) == gate(z=-0.5 * slack**2) == gate(rate=-(slack**2)) == "gate_limit"
+    assert gate(x=0.9, y=-0.9) == "gate_limit"
+    assert {gate(**{name: value}) for name in ("x", "y", "z", "rate") for value in (math.nan, math.inf)} == {"gate_not_finite"}
+
+
+@pytest.mark.parametrize("bad", [(math.nan, 0.0, 0.0), (0.0, 0.0, 0.6), (0.9, 0.9, 0.0)])
+def test_what_a_stage_lets_through_ends_at_the_gate(monkeypatch, bad):
+    wrong = VelocityCommand(CorridorVector(*bad), 0.0)
+    monkeypatch.setattr("safety.filter.limit_command", lambda *_: (wrong, ()))
+    monkeypatch.setattr("safety.shield.Shield.choose", lambda _self, wanted, *_: Decision(wanted, (), 1.0, 1.0))
+    sent, verdict = SafetyFilter(config()).apply(command(0.1), state(), scan(), 0.0)
+    assert sent.velocity == CorridorVector(0.0, 0.0, 0.0)
+    assert verdict.fault in {"gate_not_finite", "gate_limit"}
