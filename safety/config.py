@@ -143,11 +143,6 @@ class SafetyConfig(_Frozen):
         """Distance the vehicle's centre keeps from an obstacle, before estimate errors are added, m."""
         return self.vehicle_radius_m + self.margin_m
 
-    @property
-    def erosion_m(self) -> float:
-        """Distance the vehicle's centre keeps from edges of the fence along an axis; slanted ones get more (`PolygonFence`)."""
-        return self.vehicle_radius_m + self.position_error_m + self.margin_m
-
     def eroded_fence(self) -> PolygonFence:
         """The fence as the vehicle's centre must keep to it: radius, errors of the estimate and margin taken off by distance."""
         slack_m = self.position_error_m + self.drift_m + self.margin_m

@@ -89,7 +89,6 @@ def test_delay_and_distances_add_up():
 
 def test_keep_in_takes_radius_margin_and_error_off():
     c = config(fence=Fence(min_m=(0, -4, 0), max_m=(10, 4, 3)), vehicle_radius_m=0.3, margin_m=0.1, position_error_m=0.05)
-    assert c.erosion_m == pytest.approx(0.45)
     assert c.drift_m == pytest.approx(0.05 * 0.85)
     assert c.keep_in_z() == pytest.approx((0.2925, 2.7075))
     assert c.eroded_fence().room_m([(0.4925, 0.0), (9.5075, 3.5075), (5.0, 0.0)]) == pytest.approx([0.0, 0.0, 3.5075])

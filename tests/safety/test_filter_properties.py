@@ -212,7 +212,7 @@ def test_mirrored_world_gives_the_mirrored_command(boxes, ux, uy, vx, vy):
     mirrored = [(b[0], -b[3], b[2], -b[1]) for b in boxes]
     here, _ = once(command(ux, uy), state(x=XC, y=YC, v=(vx, vy, 0)), view(boxes, XC, YC, centre=(XC, YC)))
     there, _ = once(command(ux, -uy), state(x=XC, y=YC, v=(vx, -vy, 0)), view(mirrored, XC, YC, centre=(XC, YC)))
-    assert away(command(ux, uy), here) == pytest.approx(away(command(ux, -uy), there), abs=5e-3)
+    assert away(command(ux, uy), here) == pytest.approx(away(command(ux, -uy), there), abs=1e-2)  # cells have no middle row
 
 
 @given(boxes_around, st.sampled_from([1, 2, 3]), speed, speed, st.floats(-0.8, 0.8))

@@ -261,3 +261,11 @@ def test_same_scans_give_the_same_map_in_the_same_space(seed):
         assert free._seen_s.shape == free._spare.shape == (SIDE_CELLS, SIDE_CELLS)
         maps.append(free._seen_s)
     assert np.array_equal(*maps)
+
+
+def test_quick_look_around_claims_nothing_it_cannot_know():
+    """Before the first scan, and at the rim of the map, what is around must be counted."""
+    assert not FreeSpace(C).all_seen_around(5.0, 0.0, 0.0)
+    free = looked(ranges=np.full(360, np.inf), beams=360, fov=2.0 * math.pi)
+    assert free.all_seen_around(5.05, 0.05, 0.0)
+    assert not free.all_seen_around(5.0 + 6.3, 0.05, 0.0)
