@@ -56,7 +56,8 @@ def forget(root: Path, kept: tuple[str, ...] = ("campaigns.mutation", "sim_gatew
     """Drop every imported module that lies under `root`, but for those that know nothing of what may be swapped."""
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
-        ours = file is not None and Path(file).is_relative_to(root)
+        installed = file is not None and "site-packages" in Path(file).parts  # the environment may lie under `root`, too
+        ours = file is not None and not installed and Path(file).is_relative_to(root)
         if ours and name not in {"campaigns", "__main__"} and not name.startswith(kept):
             del sys.modules[name]
 
