@@ -175,6 +175,9 @@ def main() -> int:
     accidents = [one for one in load_accidents() if not chosen.only or any(text in one.name for text in chosen.only)]
     kept = _noticed(chosen.out, chosen.ignore) if chosen.missing and chosen.out else {}
     accidents = [one for one in accidents if one.name not in kept]
+    if chosen.again:
+        again = _noticed(chosen.again, chosen.ignore)
+        accidents = [one for one in accidents if one.name in again]
     if chosen.handful:
         accidents = handful(accidents, chosen.handful, date.today().toordinal())
     if chosen.again:
