@@ -69,7 +69,7 @@ class Pilot:
         air.wait(lambda: air.autopilot.armed)
         self._axes = {"up": 0.8}
         air.wait(lambda: air.gateway.vehicle.simulation.truth.position_m[2] > 1.1)
-        self._axes = {"ahead": 0.1}
+        self._axes = {"ahead": 0.28}  # beyond the dead zone, bent by the expo: 0.8 m/s
         air.wait(lambda: air.gateway.vehicle.simulation.truth.position_m[0] > 3.0)
         self._axes = {}
         time.sleep(0.5)
