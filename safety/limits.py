@@ -115,7 +115,7 @@ def _share_within(added: CorridorVector, before: CorridorVector, change: float) 
     nearest = _scaled(before, min(max(along / before2, 0.0), 1.0) if before2 > 0.0 else 0.0)
     if _length(_minus(added, nearest)) <= change + ROUNDING_M_S:
         return 1.0
-    if along <= 0.0:
+    if along <= 0.0 or before2 <= 0.0:  # squares of tiny numbers are zero
         return change / math.sqrt(size2)
     across2 = max(size2 - along * along / before2, 0.0)
     beside = change / math.sqrt(across2) if across2 > 0.0 else math.inf
