@@ -12,6 +12,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from campaigns.ports import free_port
 from campaigns.sabotage import FAULTS
 from campaigns.wire_tap import ByteTap, WireTap
 from flight.gateway_process import GatewayProcess, GatewayReady
@@ -79,8 +80,8 @@ class Scene:
     def __init__(self, cell: Cell, seed: int, folder: Path) -> None:
         self.cell = cell
         self._seed, self._folder = seed, folder
-        self._onboard, self._fly_port, ground = (_free_port(socket.SOCK_DGRAM) for _ in range(3))
-        self._lidar = _free_port(socket.SOCK_STREAM)
+        self._onboard, self._fly_port, ground = (free_port(socket.SOCK_DGRAM) for _ in range(3))
+        self._lidar = free_port(socket.SOCK_STREAM)
         arguments = ["--world", str(WORLD), "--seed", str(seed), "--onboard-port", str(self._onboard)]
         arguments += ["--gcs-port", str(ground), "--lidar-port", str(self._lidar)]
         self.gateway = GatewayProcess(arguments, folder / "gateway.json")
@@ -175,13 +176,3 @@ def _hurry(pid: int, threads: list[int | None] | None = None) -> None:
     for thread in chosen:
         with contextlib.suppress(PermissionError, ProcessLookupError):
             os.sched_setscheduler(thread or 0, os.SCHED_FIFO, os.sched_param(HARDWARE_PRIORITY))
-
-
-def _free_port(kind: socket.SocketKind) -> int:
-    """A port that nothing uses now, low enough for the gateway's own ones above it."""
-    while True:
-        with socket.socket(socket.AF_INET, kind) as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = int(probe.getsockname()[1])
-        if port < 61_000:
-            return port

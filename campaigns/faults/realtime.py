@@ -23,6 +23,7 @@ from campaigns.faults.catalogue import Entry, Reaction
 from campaigns.faults.oracle import judge
 from campaigns.faults.run import Case
 from campaigns.faults.stage import Trace
+from campaigns.ports import free_port
 from campaigns.realtime import fence_margin_m
 from flight.mission import load_mission
 from flight.px4 import COMMAND_DO_SET_MODE
@@ -80,21 +81,11 @@ def write_mission(entry: Entry, policy: Path, folder: Path) -> Path:
     """World and mission of one flight, on free ports."""
     world, mission = folder / "world.yaml", folder / "mission.yaml"
     world.write_text(WORLD)
-    onboard, ground = _free_port(socket.SOCK_DGRAM), _free_port(socket.SOCK_DGRAM)
+    onboard, ground = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
     faults = json.dumps([text_of(fault) for fault in entry.faults])
-    ports = {"onboard_port": onboard, "gcs_port": ground, "lidar_port": _free_port(socket.SOCK_STREAM)}
+    ports = {"onboard_port": onboard, "gcs_port": ground, "lidar_port": free_port(socket.SOCK_STREAM)}
     mission.write_text(MISSION.format(policy=policy.resolve(), world=world, faults=faults, **ports))
     return mission
-
-
-def _free_port(kind: socket.SocketKind) -> int:
-    """The gateway binds 40 and 4020 above it too, so high ones are passed over."""
-    while True:
-        with socket.socket(socket.AF_INET, kind) as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = int(probe.getsockname()[1])
-        if port < 61_000:
-            return port
 
 
 def fly(entry: Entry, policy: Path) -> Result:

@@ -157,7 +157,11 @@ def test_what_cannot_be_honoured_is_refused_by_name(policy_path: Path, wish: dic
 def test_what_can_be_honoured_is_accepted(policy_path: Path) -> None:
     wide = ActionLayout(low=(-2.0, -1.0, -1.0, -2.0), high=(2.0, 1.0, 1.0, 2.0))
     sha256 = PolicyRunner.load(policy_path).sha256
-    PolicyRunner.load(policy_path, expected_sha256=sha256.upper(), expected_observation=default_layout(), allowed_action=wide)
+    runner = PolicyRunner.load(
+        policy_path, expected_sha256=sha256.upper(), expected_observation=default_layout(), allowed_action=wide
+    )
+    assert runner.sha256 == sha256
+    assert np.isfinite(runner.step(some_observation())).all()
 
 
 def test_feed_forward_policy_has_no_state(feed_forward_path: Path) -> None:
