@@ -237,6 +237,12 @@ def start(arguments):
     )
 
 
+def last_decisions(metrics):
+    """Of the last whole line; the file is written anew when a run goes on, and may be empty at that moment."""
+    lines = metrics.read_text().split("\n")[:-1]
+    return json.loads(lines[-1])["decisions"] if lines else 0
+
+
 def test_killed_run_goes_on_and_a_terminated_one_saves(tmp_path):
     preset = write_preset(tmp_path / "long.yaml", decisions=10_000_000, evaluation={"every_decisions": 10_000_000})
     out = tmp_path / "run"
@@ -248,7 +254,7 @@ def test_killed_run_goes_on_and_a_terminated_one_saves(tmp_path):
     process = start(["--resume", str(out)])
     metrics = out / "metrics.jsonl"
     end = time.monotonic() + 120.0
-    while json.loads(metrics.read_text().splitlines()[-1])["decisions"] < before + 3 * UPDATE:
+    while last_decisions(metrics) < before + 3 * UPDATE:
         assert time.monotonic() < end
         assert process.poll() is None
         time.sleep(0.05)
