@@ -30,7 +30,8 @@ from flight.gateway_process import GatewayProcess, GatewayReady
 from flight.interrupt import Interrupt, Interrupted
 from flight.lidar import LidarDriver, open_lidar
 from flight.lidar.from_link import feed_from_link
-from flight.link import VehicleLink, check_port_is_free
+from flight.link import VehicleLink
+from flight.mavsdk_support import check_port_is_free
 from flight.mission import Mission, load_mission
 from flight.preflight import (
     LOOP_RATE_HZ,

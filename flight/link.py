@@ -13,18 +13,16 @@ from __future__ import annotations
 import json
 import logging
 import math
-import socket
-import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any
-from urllib.parse import urlsplit
 
 from flight.authority import Authority
 from flight.errors import NoVehicleError, RefusedError, VehicleCommandError
 from flight.guard.client import GuardLostError, SetpointGuard
 from flight.guard.core import State
+from flight.mavsdk_support import Answer, check_port_is_free, route_mavsdk_log
 from flight.px4 import (
     AUTOPILOT_COMPONENT,
     AUTOPILOT_PX4,
@@ -34,7 +32,6 @@ from flight.px4 import (
     MESSAGE_ID,
     MODE_FLAG_CUSTOM,
     RESULT_ACCEPTED,
-    RESULT_NAMES,
     FlightMode,
     mode_name,
 )
@@ -102,7 +99,7 @@ class VehicleLink:
         from mavsdk import Configuration, ConnectionResult, Mavsdk  # noqa: PLC0415  (loads a 30 MB library)
 
         check_port_is_free(self.url)
-        _route_mavsdk_log()
+        route_mavsdk_log()
         deadline = self._clock() + timeout_s
         self.guard.start(timeout_s, keep_waiting)
         configuration = Configuration.create_manual(OWN_SYSTEM_ID, OWN_COMPONENT_ID, True)
@@ -341,7 +338,7 @@ class VehicleLink:
         fields: dict[str, float] = {f"param{i + 1}": 0.0 for i in range(7)}
         fields.update({f"param{i + 1}": float(value) for i, value in enumerate(parameters)})
         fields |= {"target_system": self._target[0], "target_component": self._target[1], "command": command, "confirmation": 0}
-        answer = _Answer()
+        answer = Answer()
         message = self._message("COMMAND_LONG", 0, 0, *self._target, json.dumps(fields))
         self._direct.send_command_async(message, answer.on_ack)
         if not self.wait_until(answer.done.is_set, COMMAND_DEADLINE_S, keep_alive):
@@ -350,7 +347,7 @@ class VehicleLink:
             raise VehicleCommandError(f"the vehicle refused {what}: {answer.text}{self._last_words()}")
 
     def _act(self, method: str, what: str, keep_alive: Callable[[], None] | None) -> None:
-        answer = _Answer()
+        answer = Answer()
         getattr(self._action, f"{method}_async")(answer.on_action)
         if not self.wait_until(answer.done.is_set, COMMAND_DEADLINE_S, keep_alive):
             raise VehicleCommandError(f"the vehicle did not answer the command to {what} within {COMMAND_DEADLINE_S:g} s")
@@ -388,61 +385,3 @@ class VehicleLink:
             raise VehicleCommandError(
                 f"parameter {name} reads back {held:g} after setting {value:g}; set it by hand in QGroundControl"
             )
-
-
-class _Answer:
-    """The answer to one command, filled on MAVSDK's thread."""
-
-    def __init__(self) -> None:
-        self.done = threading.Event()
-        self.result = -1
-        self.text = "no answer"
-
-    def on_ack(self, result: Any, ack: Any, _user_data: Any) -> None:
-        """Final COMMAND_ACK of a direct command."""
-        if result.name == "SUCCESS":
-            self.result = int(json.loads(ack.fields_json).get("result", -1))
-            self.text = RESULT_NAMES.get(self.result, f"result {self.result}")
-        else:
-            self.text = str(result.name).lower().replace("_", " ")
-        self.done.set()
-
-    def on_action(self, result: Any, _user_data: Any) -> None:
-        """Result of an Action plugin call."""
-        self.result = RESULT_ACCEPTED if result.name == "SUCCESS" else -1
-        self.text = str(result.name).lower().replace("_", " ")
-        self.done.set()
-
-
-def check_port_is_free(url: str) -> None:
-    """For a listening UDP URL: bind its port once, so that a busy one is named before anything else starts."""
-    parts = urlsplit(url)
-    if parts.scheme not in ("udp", "udpin"):
-        return
-    host, port = parts.hostname or "0.0.0.0", parts.port or 0
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            raise RefusedError(
-                f"cannot listen on {url}: {error.strerror}; stop the program that uses UDP port {port} or change the "
-                "connection in the mission"
-            ) from None
-
-
-_log_routed = False
-
-
-def _route_mavsdk_log() -> None:
-    """Send MAVSDK's own log to Python logging: its default writes to standard output, which belongs to `--json`."""
-    global _log_routed  # noqa: PLW0603  (MAVSDK's log has one subscriber per process)
-    if _log_routed:
-        return
-    from mavsdk import log_subscribe  # noqa: PLC0415
-
-    def forward(level: Any, message: str, _file: str | None, _line: int) -> bool:
-        log.log(10 * min(int(level) + 1, 4) if int(level) >= 2 else logging.DEBUG, "mavsdk: %s", message)
-        return True
-
-    log_subscribe(forward)
-    _log_routed = True

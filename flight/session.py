@@ -25,7 +25,8 @@ from flight.interrupt import Interrupt
 from flight.landing import Landing
 from flight.lidar import LidarDriver, body_motion, open_lidar
 from flight.lidar.from_link import feed_from_link
-from flight.link import VehicleLink, check_port_is_free
+from flight.link import VehicleLink
+from flight.mavsdk_support import check_port_is_free
 from flight.mission import Mission
 from flight.offboard import Ending, OffboardFlight, quiet_interpreter
 from flight.preflight import (

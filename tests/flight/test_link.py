@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from stand import Stand
 
 from flight.errors import MissionError, NoVehicleError, RefusedError, VehicleCommandError
-from flight.link import VehicleLink, check_port_is_free
+from flight.link import VehicleLink
+from flight.mavsdk_support import check_port_is_free
 from flight.px4 import FlightMode, mode_name, mode_of
 from flight.telemetry import MAX_DRIFT, MESSAGES, Attitude, BootClock, Imu, Telemetry, acceleration_ned
 from safety.frames import CorridorFrame, CorridorVector, NedVector
