@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safety_plant import command, config
 
+from safety.config import speed_cap_m_s
 from safety.frames import CorridorVector
 from safety.limits import AT_REST, LastSent, limit_command, sent_after
 
@@ -31,6 +32,21 @@ def distance_to_way(p, end) -> float:
     """Distance of a point from the straight way between zero and `end`."""
     share = np.clip(p @ end / max(end @ end, 1e-300), 0.0, 1.0)
     return float(np.linalg.norm(p - share * end))
+
+
+def test_a_length_beyond_all_numbers_is_shortened_to_the_limit():
+    """Either part is finite, their length is not."""
+    sent, rules = limited((1.7e308, -1.7e308, 0.0), AT_REST, max_acceleration_m_s2=100.0, max_jerk_m_s3=1000.0)
+    assert sent == pytest.approx((1.2 / math.sqrt(2.0), -1.2 / math.sqrt(2.0), 0.0))
+    assert rules == {"speed_limit"}
+
+
+def test_the_speed_limit_falls_with_the_range_of_the_sensor():
+    chosen = config(max_acceleration_m_s2=100.0, max_jerk_m_s3=1000.0)
+    for sight in (0.5, 1.0, 2.0):
+        sent = limit_command(command(1.2), AT_REST, DT_S, sight, chosen)[0].velocity.x
+        assert sent == pytest.approx(speed_cap_m_s(sight - chosen.keep_out_m, chosen.delay_s, chosen.braking_m_s2))
+        assert chosen.stop_distance_m(sent) < sight
 
 
 def test_growth_takes_two_ticks_from_rest():
