@@ -22,6 +22,7 @@ from campaigns.mutation.inplace import function_at, replace
 from campaigns.mutation.ledger import KILLED, NO_CHANGE, SURVIVED, TIMEOUT, Ledger, Verdict
 from campaigns.mutation.mutants import Mutant, SourceFile, changed_lines, definitions, mutants_of
 from campaigns.mutation.report import MOST_EQUIVALENT, Equivalent, figures, load_equivalents
+from campaigns.mutation.suite import properties
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = textwrap.dedent(
@@ -198,3 +199,8 @@ def test_equivalent_list_is_short_current_and_each_has_its_proof():
     keys = [one.key for one in listed]
     assert len(keys) == len(set(keys))
     assert len(listed) <= MOST_EQUIVALENT * max(count, 1)
+
+
+def test_the_safety_layer_has_thirty_properties_and_more():
+    found = properties(ROOT)
+    assert len(set(found)) == len(found) >= 30
