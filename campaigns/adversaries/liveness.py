@@ -27,6 +27,7 @@ BACK_X_M, POCKET_WIDTH_M = 9.0, 1.3
 LEAVING_M_S = 0.5  # backwards, as the policy's own limit
 SLOW_M_S = 0.25  # bounds are distance at this speed, and a few seconds to begin with
 PATIENCE_S = 6.0
+PHANTOM_NOISE_M = 0.005  # the same to the last bit from scan to scan, in motion, would be a frozen scan (L2), rightly refused
 Boxes = list[tuple[float, float, float, float]]
 
 
@@ -127,7 +128,7 @@ def _phantom(
         if now_s >= until_s:
             return scan
         ranges = scan.ranges_m.copy()
-        ranges[84:96] = range_m
+        ranges[84:96] = range_m + PHANTOM_NOISE_M * np.random.default_rng(scan.sequence).standard_normal(12)
         return replace(scan, ranges_m=ranges)
 
     return Escape(f"phantom {name}", [], (7.0, 0.0), 0.0, leave, out, way_m=1.0, alter=alter)
