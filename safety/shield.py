@@ -171,7 +171,7 @@ class Shield:
         way[:2] = allowed.push_m_s
         tube = tubes(around.start, way[None], self._config)
         clear, rooms = self._tube_clearances(tube, around), self._guard.rooms_m(tube, around.start, near)
-        return way if allowed.permits(way[None], clear, rooms)[0] else allowed.hover_m_s
+        return way if allowed.for_the_way_out(self._config).permits(way[None], clear, rooms)[0] else allowed.hover_m_s
 
     def _passing(self, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Integers:
         """Indices of the candidates [c, 3] that keep to the bounds; unseen space is counted only for those that pass all else."""
