@@ -103,9 +103,7 @@ class FreeSpace:
                 np.minimum(grid[:-1], grid[1:], out=self._spare[:-1])
                 np.minimum(self._spare[:-2], grid[2:], out=grid[1:-1])
 
-    def unseen(
-        self, x_m: Floats, y_m: Floats, near_m: Floats, now_s: float, wide: bool, spared_m: Floats = NOWHERE
-    ) -> Integers:
+    def unseen(self, x_m: Floats, y_m: Floats, near_m: Floats, now_s: float, wide: bool, spared_m: Floats = NOWHERE) -> Integers:
         """How many unseen cells the hull touches with its centre at x, y [...]; weighted, 0 = none.
 
         The hull with its errors, one cell more when `wide`. `near_m` [2, k]: known returns, whose surroundings count as known.

@@ -2,8 +2,8 @@
 
 A command may lead through no unseen cell, or, when braking itself does (start in the unseen, drift, memory lost), through none
 that braking keeps clear of, through no more than braking, and to a stop no nearer to any: without that, small steps would add up.
-Counted with one cell to spare, so that the grid's own steps are no breach: only the exact count slows down. What will be forgotten
-before the vehicle stands is forgotten already for a command, not yet for braking: so memory that runs out is not run after.
+Counted with one cell to spare, so that the grid's own steps are no breach: only the exact count slows down. What will be
+forgotten before the vehicle stands is forgotten already for a command, not yet for braking: no command runs after old memory.
 """
 
 from __future__ import annotations

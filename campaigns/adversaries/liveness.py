@@ -105,8 +105,8 @@ def _home(view: View) -> VelocityCommand:
     return towards(view, np.array((7.0, 0.0)) - view.place[:2], speed=1.0)
 
 
-def _dead_end(deep_m: float, leave: Callable[[View], VelocityCommand], how: str) -> Escape:
-    mouth, half = BACK_X_M - deep_m, 0.5 * POCKET_WIDTH_M
+def _dead_end(deep_m: float, leave: Callable[[View], VelocityCommand], how: str, wide_m: float = POCKET_WIDTH_M) -> Escape:
+    mouth, half = BACK_X_M - deep_m, 0.5 * wide_m
     walls = [
         (BACK_X_M, -half - 0.2, BACK_X_M + 0.2, half + 0.2),
         (mouth, half, BACK_X_M, half + 0.2),

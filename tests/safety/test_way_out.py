@@ -1,4 +1,4 @@
-"""Pressed into one margin, the way out may use up some of another: else noise in a side wall keeps the vehicle at the one ahead."""
+"""Pressed into one margin, the way out may use up some of another: else noise in a side wall keeps it at the one ahead."""
 
 from __future__ import annotations
 
