@@ -113,8 +113,9 @@ def _dead_end(deep_m: float, leave: Callable[[View], VelocityCommand], how: str,
         (mouth, -half - 0.2, BACK_X_M, -half),
     ]
     start, wanted = mouth - 1.0, mouth - 0.5
+    size = f"{deep_m:g} m deep" if wide_m == POCKET_WIDTH_M else f"{deep_m:g} m deep and {wide_m:g} m wide"
     return Escape(
-        f"dead end {deep_m:g} m deep, left {how}", walls, (start, 0.0), 0.0, leave, lambda view: view.place[0] < wanted,
+        f"dead end {size}, left {how}", walls, (start, 0.0), 0.0, leave, lambda view: view.place[0] < wanted,
         way_m=deep_m + 0.5, enter_s=(deep_m + 1.0) / 0.8 + 2.0,
     )  # fmt: skip
 
@@ -142,6 +143,7 @@ def _escapes() -> list[Escape]:
     beside = BACK_X_M - 0.35
     return [
         *ends,
+        _dead_end(2.0, _turn_and_go, "turned", wide_m=1.0),  # backwards that is too narrow: docs/safety.md, residual risks
         _phantom("at the hull that stays, backwards", 0.36, 99.0, _backwards, _past(-1.0)),
         _phantom("at the hull for 0.2 s, forwards", 0.36, 0.2, _forwards, _past(1.0)),
         _phantom("inside the hull for 0.2 s, forwards", 0.2, 0.2, _forwards, _past(1.0)),
