@@ -52,8 +52,8 @@ class Hidden:
 
     def rows(self, chosen: slice) -> Hidden:
         """The counts of some tubes."""
-        counts = (self.soon, self.wide, self.exact, self.more)
-        return Hidden(*(count[chosen] for count in counts), self.gap_m[chosen], self.brake_m)
+        counts = (self.soon[chosen], self.wide[chosen], self.exact[chosen], self.more[chosen])
+        return Hidden(*counts, self.gap_m[chosen], self.brake_m)
 
     def permits(self, others: Hidden) -> Booleans:
         """Which tubes see enough: they touch nothing unseen, or this one does and they lead no further in."""
