@@ -11,7 +11,7 @@ Braking must always stay available, so nothing may be worse than braking. Beyond
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +69,11 @@ class Allowance:
         level = (candidates[:, 2] >= self.sink_m_s - EPSILON_M) & (candidates[:, 2] <= self.climb_m_s + EPSILON_M)
         permitted: Booleans = clear & inside & level & (self.shortfall_m_s(candidates) <= EPSILON_M)
         return permitted
+
+    def for_the_way_out(self, config: SafetyConfig) -> Allowance:
+        """The same for what leads out of a margin: it may near other points within theirs, as far as the worst is without it."""
+        worst = max(float(self.clearance_m.min(initial=0.0)), -config.margin_m)
+        return replace(self, clearance_m=np.minimum(self.clearance_m, worst))
 
     @property
     def hover_m_s(self) -> Floats:

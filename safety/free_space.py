@@ -29,6 +29,7 @@ VICINITY_CELLS = 2  # around the swept hull: what is known there stays known whi
 STEP_M = 0.2  # between the discs that stand for a swept hull
 _REACH_ERROR_M = CELL_M * math.sqrt(2.0)  # of a cell's far corner, seen from anywhere in the cell of the LiDAR
 _WIDEST_RAD = math.radians(60.0)  # nearer cells fill more of the view: they are the vehicle's own
+NOWHERE = np.empty((2, 0))
 
 
 class FreeSpace:
@@ -102,10 +103,11 @@ class FreeSpace:
                 np.minimum(grid[:-1], grid[1:], out=self._spare[:-1])
                 np.minimum(self._spare[:-2], grid[2:], out=grid[1:-1])
 
-    def unseen(self, x_m: Floats, y_m: Floats, near_m: Floats, now_s: float, wide: bool) -> Integers:
+    def unseen(self, x_m: Floats, y_m: Floats, near_m: Floats, now_s: float, wide: bool, spared_m: Floats = NOWHERE) -> Integers:
         """How many unseen cells the hull touches with its centre at x, y [...]; weighted, 0 = none.
 
         The hull with its errors, one cell more when `wide`. `near_m` [2, k]: known returns, whose surroundings count as known.
+        `spared_m` [2, n]: cells that the hull touches with its centre there do not count.
         """
         boxes = self._kernels[0 if wide else 1]
         rim = int(boxes.max())
@@ -114,6 +116,7 @@ class FreeSpace:
         hidden = self._hidden(low_x, low_y, int(ix.max()) + rim + 1, int(iy.max()) + rim + 1, near_m, now_s)
         if hidden is None:
             return np.full(x_m.shape, SIDE_CELLS * SIDE_CELLS, dtype=np.intp)
+        _clear(hidden, boxes, self._indices(spared_m[0], 0) - low_x, self._indices(spared_m[1], 1) - low_y)
         if not hidden.any():
             return np.zeros(x_m.shape, dtype=np.intp)
         counts: Integers = _box_counts(hidden, boxes, rim)[ix - (low_x + rim), iy - (low_y + rim)]
@@ -271,6 +274,13 @@ def _boxes(radius_m: float) -> Integers:
     widths = [(i, 1 + math.floor(math.sqrt(reach * reach - max(i - 1, 0) ** 2))) for i in range(math.floor(reach) + 2)]
     corners = [box for box, after in zip(widths, [*widths[1:], (0, -1)], strict=True) if after[1] < box[1]]
     return np.array(corners)
+
+
+def _clear(hidden: Booleans, boxes: Integers, i: Integers, j: Integers) -> None:
+    """Take the cells of the boxes around middle cells i, j [n], which may lie outside the window, out of the hidden ones."""
+    for row, column in set(zip(i.tolist(), j.tolist(), strict=True)):
+        for a, b in boxes.tolist():
+            hidden[max(row - a, 0) : max(row + a + 1, 0), max(column - b, 0) : max(column + b + 1, 0)] = False
 
 
 def _box_counts(hidden: Booleans, boxes: Integers, rim: int) -> Integers:

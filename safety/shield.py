@@ -122,28 +122,27 @@ class Shield:
         return config.keep_out_m + apart + errors + stop
 
     def _within_reach(self, around: Surroundings, reach_m: float) -> Surroundings:
-        """Only the points that some tube of this tick can come near to: the others cannot change a decision."""
+        """Only the points that some tube of this tick can come near to. The view keeps all: also those explain unseen cells."""
         start = around.start
         dx, dy = around.x_m - start.position_m[0, 0], around.y_m - start.position_m[0, 1]
         near = dx * dx + dy * dy < (reach_m + around.extra_m) ** 2
-        x, y = around.x_m[near], around.y_m[near]
-        return Surroundings(x, y, around.extra_m[near], around.view.beside(np.array((x, y))), around.position, around.start)
+        return Surroundings(around.x_m[near], around.y_m[near], around.extra_m[near], around.view, around.position, around.start)
 
     def _judge(self, first: Floats, around: Surroundings, near: NearFence, found: list[Intervention]) -> tuple[bool, Bounds]:
         """Judge the wanted command (row 0) against what braking (row 1) sets."""
         tube = tubes(around.start, first, self._config)
         clear, fence = self._tube_clearances(tube, around), self._guard.rooms_m(tube, around.start, near)
-        position = np.array((around.position.x, around.position.y))
+        points, position = np.array((around.x_m, around.y_m)), np.array((around.position.x, around.position.y))
         pressed = (fence[1, :-2] < 0.0).any() or (clear[1] < 0.0).any()
         ways = self._guard.ways_out(tube, near) if pressed else None
-        allowed = allowance(tube, clear[1], fence[1], around.view.near_m, position, ways, self._config)
+        allowed = allowance(tube, clear[1], fence[1], points, position, ways, self._config)
         hidden = self._sight.hidden(tube, around.view)
         bounds = Bounds(allowed, hidden.rows(slice(1, 2)))
         if not allowed.permits(first[:1], clear[:1], fence[:1])[0]:
             found.extend(_reasons(allowed, first[0], clear[0], fence[0]))
             return False, bounds
         if not bounds.hidden.permits(hidden)[0]:
-            found.append(Intervention("unseen", float(hidden.wide[0]), float(hidden.wide[1])))
+            found.append(Intervention("unseen", float(hidden.soon[0]), float(hidden.soon[1])))
             return False, bounds
         return True, bounds
 
@@ -172,7 +171,7 @@ class Shield:
         way[:2] = allowed.push_m_s
         tube = tubes(around.start, way[None], self._config)
         clear, rooms = self._tube_clearances(tube, around), self._guard.rooms_m(tube, around.start, near)
-        return way if allowed.permits(way[None], clear, rooms)[0] else allowed.hover_m_s
+        return way if allowed.for_the_way_out(self._config).permits(way[None], clear, rooms)[0] else allowed.hover_m_s
 
     def _passing(self, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Integers:
         """Indices of the candidates [c, 3] that keep to the bounds; unseen space is counted only for those that pass all else."""

@@ -1,8 +1,9 @@
 """How much unseen space a brake tube leads through, compared with what braking itself would need.
 
-A command may lead through no unseen cell, or, when braking itself does (start in the unseen, drift, memory run out), through no
-more than braking, and to a stop no nearer to any: without that, small steps would add up. Counted with one cell to spare, so that
-the grid's own steps are no breach: only the exact count slows down.
+A command may lead through no unseen cell, or, when braking itself does (start in the unseen, drift, memory lost), through none
+that braking keeps clear of, through no more than braking, and to a stop no nearer to any: without that, small steps would add up.
+Counted with one cell to spare, so that the grid's own steps are no breach: only the exact count slows down. What will be
+forgotten before the vehicle stands is forgotten already for a command, not yet for braking: no command runs after old memory.
 """
 
 from __future__ import annotations
@@ -16,46 +17,48 @@ from numpy.typing import NDArray
 from safety.braking import Tubes
 from safety.config import SafetyConfig
 from safety.frames import CorridorVector
-from safety.free_space import STEP_M, FreeSpace
+from safety.free_space import NOWHERE, STEP_M, FreeSpace
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 Booleans = NDArray[np.bool_]
 ROUNDING_M = 1e-9
+STANDING_AFTER = 2.0  # blind times until less of the way is left than what stays known around a vehicle
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The map of free space at a moment, and the known returns [2, k] near the vehicle."""
+    """The map of free space at a moment, and the known returns [2, k]."""
 
     free: FreeSpace
     near_m: Floats
     now_s: float
-
-    def beside(self, near_m: Floats) -> View:
-        """The same with other returns."""
-        return View(self.free, near_m, self.now_s)
 
 
 @dataclass(frozen=True, slots=True)
 class Hidden:
     """Unseen cells on tubes [c], at the worst place of each: with one cell to spare, and exactly.
 
-    `gap_m` [c]: from the stop points to the nearest unseen cell.
+    `soon`: the same as `wide`, when the vehicle will stand. `more`: exactly and then, without those that braking touches.
+    `gap_m` [c]: from the stop points to the nearest unseen cell. `brake_m` [2, n]: places on the way of braking.
     """
 
+    soon: Integers
     wide: Integers
     exact: Integers
+    more: Integers
     gap_m: Floats
+    brake_m: Floats
 
     def rows(self, chosen: slice) -> Hidden:
         """The counts of some tubes."""
-        return Hidden(self.wide[chosen], self.exact[chosen], self.gap_m[chosen])
+        counts = (self.soon[chosen], self.wide[chosen], self.exact[chosen], self.more[chosen])
+        return Hidden(*counts, self.gap_m[chosen], self.brake_m)
 
     def permits(self, others: Hidden) -> Booleans:
         """Which tubes see enough: they touch nothing unseen, or this one does and they lead no further in."""
-        no_more = (others.wide <= self.wide) & (others.exact <= self.exact) & (others.gap_m >= self.gap_m - ROUNDING_M)
-        permitted: Booleans = (others.wide == 0) | no_more
+        no_more = (others.more == 0) & (others.wide <= self.wide) & (others.exact <= self.exact)
+        permitted: Booleans = (others.soon == 0) | (no_more & (others.gap_m >= self.gap_m - ROUNDING_M))
         return permitted
 
 
@@ -65,6 +68,7 @@ class Sight:
     def __init__(self, config: SafetyConfig) -> None:
         longest = config.stop_distance_m(2.0 * config.max_horizontal_speed_m_s)
         self._shares = np.linspace(0.0, 1.0, math.ceil(longest / STEP_M) + 1)
+        self._ahead_s = min(STANDING_AFTER * config.delay_s, 0.5 * config.memory_s)
 
     def lost(self, position: CorridorVector, view: View) -> bool:
         """Whether the vehicle is in unseen space."""
@@ -76,14 +80,17 @@ class Sight:
     def hidden(self, tube: Tubes, view: View, brake: Hidden | None = None) -> Hidden:
         """The unseen cells on each tube, of both models. Without `brake` the last tube is braking's own.
 
-        Where braking touches nothing unseen nothing else may, and only `wide` is counted.
+        Where braking touches nothing unseen nothing else may, and only `soon` is counted.
         """
         leg = tube.stop_m - tube.turn_m
         x, y = (tube.turn_m[..., axis, None] + leg[..., axis, None] * self._shares for axis in (0, 1))
-        wide = view.free.unseen(x, y, view.near_m, view.now_s, wide=True).max(axis=(0, 2))
-        if (wide if brake is None else brake.wide)[-1] == 0:
-            return Hidden(wide, wide, np.zeros(wide.shape))
-        exact = view.free.unseen(x, y, view.near_m, view.now_s, wide=False).max(axis=(0, 2))
+        free, near, now_s = view.free, view.near_m, view.now_s
+        soon = free.unseen(x, y, near, now_s + self._ahead_s, wide=True).max(axis=(0, 2))
+        if (soon if brake is None else brake.soon)[-1] == 0:
+            return Hidden(soon, soon, soon, soon, np.zeros(soon.shape), NOWHERE)
+        braking = np.array((x[:, -1].reshape(-1), y[:, -1].reshape(-1))) if brake is None else brake.brake_m
+        wide, exact = (free.unseen(x, y, near, now_s, wide=far).max(axis=(0, 2)) for far in (True, False))
+        more = free.unseen(x, y, near, now_s + self._ahead_s, False, braking).max(axis=(0, 2))
         stop_x, stop_y = tube.stop_m[..., 0].reshape(-1), tube.stop_m[..., 1].reshape(-1)
-        gaps = view.free.gap_m(stop_x, stop_y, view.near_m, view.now_s).reshape(2, -1).min(axis=0)
-        return Hidden(wide, exact, gaps)
+        gaps = free.gap_m(stop_x, stop_y, near, now_s).reshape(2, -1).min(axis=0)
+        return Hidden(soon, wide, exact, more, gaps, braking)

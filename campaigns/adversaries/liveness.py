@@ -27,6 +27,7 @@ BACK_X_M, POCKET_WIDTH_M = 9.0, 1.3
 LEAVING_M_S = 0.5  # backwards, as the policy's own limit
 SLOW_M_S = 0.25  # bounds are distance at this speed, and a few seconds to begin with
 PATIENCE_S = 6.0
+PHANTOM_NOISE_M = 0.005  # the same to the last bit from scan to scan, in motion, would be a frozen scan (L2), rightly refused
 Boxes = list[tuple[float, float, float, float]]
 
 
@@ -104,16 +105,17 @@ def _home(view: View) -> VelocityCommand:
     return towards(view, np.array((7.0, 0.0)) - view.place[:2], speed=1.0)
 
 
-def _dead_end(deep_m: float, leave: Callable[[View], VelocityCommand], how: str) -> Escape:
-    mouth, half = BACK_X_M - deep_m, 0.5 * POCKET_WIDTH_M
+def _dead_end(deep_m: float, leave: Callable[[View], VelocityCommand], how: str, wide_m: float = POCKET_WIDTH_M) -> Escape:
+    mouth, half = BACK_X_M - deep_m, 0.5 * wide_m
     walls = [
         (BACK_X_M, -half - 0.2, BACK_X_M + 0.2, half + 0.2),
         (mouth, half, BACK_X_M, half + 0.2),
         (mouth, -half - 0.2, BACK_X_M, -half),
     ]
     start, wanted = mouth - 1.0, mouth - 0.5
+    size = f"{deep_m:g} m deep" if wide_m == POCKET_WIDTH_M else f"{deep_m:g} m deep and {wide_m:g} m wide"
     return Escape(
-        f"dead end {deep_m:g} m deep, left {how}", walls, (start, 0.0), 0.0, leave, lambda view: view.place[0] < wanted,
+        f"dead end {size}, left {how}", walls, (start, 0.0), 0.0, leave, lambda view: view.place[0] < wanted,
         way_m=deep_m + 0.5, enter_s=(deep_m + 1.0) / 0.8 + 2.0,
     )  # fmt: skip
 
@@ -127,7 +129,7 @@ def _phantom(
         if now_s >= until_s:
             return scan
         ranges = scan.ranges_m.copy()
-        ranges[84:96] = range_m
+        ranges[84:96] = range_m + PHANTOM_NOISE_M * np.random.default_rng(scan.sequence).standard_normal(12)
         return replace(scan, ranges_m=ranges)
 
     return Escape(f"phantom {name}", [], (7.0, 0.0), 0.0, leave, out, way_m=1.0, alter=alter)
@@ -141,6 +143,7 @@ def _escapes() -> list[Escape]:
     beside = BACK_X_M - 0.35
     return [
         *ends,
+        _dead_end(2.0, _turn_and_go, "turned", wide_m=1.0),  # backwards that is too narrow: docs/safety.md, residual risks
         _phantom("at the hull that stays, backwards", 0.36, 99.0, _backwards, _past(-1.0)),
         _phantom("at the hull for 0.2 s, forwards", 0.36, 0.2, _forwards, _past(1.0)),
         _phantom("inside the hull for 0.2 s, forwards", 0.2, 0.2, _forwards, _past(1.0)),

@@ -160,9 +160,18 @@ def test_report_of_a_small_campaign(tmp_path, monkeypatch):
     assert (tmp_path / "map.png").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("name", ["dead end 1 m deep, left backwards", "start 1 cm from a wall ahead, turned"])
-def test_it_gets_out_in_time(name):
-    time_s, clear = ESCAPES[name].fly(1)
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("dead end 1 m deep, left backwards", 1),
+        ("dead end 1 m deep, left turned", 5),
+        ("dead end 2 m deep and 1 m wide, left turned", 0),
+        ("phantom at the hull that stays, backwards", 2),
+        ("start 1 cm from a wall ahead, turned", 1),
+    ],
+)
+def test_it_gets_out_in_time(name, seed):
+    time_s, clear = ESCAPES[name].fly(seed)
     assert time_s is not None
     assert time_s < ESCAPES[name].bound_s
     assert clear

@@ -164,10 +164,8 @@ def test_nearer_wall_never_allows_more(distance, nearer, wanted, v):
 @settings(max_examples=25, deadline=None)
 def test_larger_error_delay_or_size_never_allows_more(field, worse, distance, wanted, v):
     pose, seen = state(x=X0, v=(v, 0, 0)), view(wall(distance))
-    normal, at_ease = once(command(wanted), pose, seen)
-    careful, verdict = once(command(wanted), pose, seen, **{field: worse})
-    # where braking itself already leads through what was not seen, braking is the yardstick, not the map
-    assume("unseen" not in {found.rule for found in verdict.interventions + at_ease.interventions})
+    normal, _ = once(command(wanted), pose, seen)
+    careful, _ = once(command(wanted), pose, seen, **{field: worse})
     assert careful.velocity.x <= normal.velocity.x + 1e-9
 
 

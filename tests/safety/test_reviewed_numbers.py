@@ -110,6 +110,7 @@ REVIEWED = {
     "shield.PUSHES": (1.0, 1.5),
     "shield.FIRST_LOOK": 8,
     "shield.OUTWARD": (0.0, 0.1),
+    "sight.STANDING_AFTER": 2.0,
     "sight.STEP_M": 0.2,
     "sight.ROUNDING_M": 1e-09,
 }
