@@ -36,6 +36,15 @@ class View:
         """The same with other returns."""
         return View(self.free, near_m, self.now_s)
 
+    def unseen(self, places_m: Floats, wide: bool) -> Integers:
+        """How many unseen cells the hull touches at places [2, ...]."""
+        return self.free.unseen(places_m, self.near_m, self.now_s, wide)
+
+    def all_seen(self, begin_m: Floats, end_m: Floats) -> bool:
+        """Whether all is seen around straight legs [..., 3]: quick, and False where it must be counted."""
+        ends = np.concatenate((begin_m, end_m)).reshape(-1, 3)
+        return self.free.all_seen_between(ends.min(axis=0).tolist(), ends.max(axis=0).tolist(), self.now_s)
+
 
 @dataclass(frozen=True, slots=True)
 class Hidden:
@@ -70,8 +79,9 @@ class Sight:
         """Whether the vehicle is in unseen space."""
         if view.free.all_seen_around(position.x, position.y, view.now_s):  # the usual case
             return False
-        x, y = np.array((position.x,)), np.array((position.y,))
-        return bool(view.free.unseen(x, y, view.near_m, view.now_s, wide=False)[0])
+        place = np.array(((position.x,), (position.y,)))
+        # with one cell to spare first: the tubes need those sums anyway, and where they are zero so are the exact ones
+        return all(view.unseen(place, wide)[0] > 0 for wide in (True, False))
 
     def hidden(self, tube: Tubes, view: View, brake: Hidden | None = None) -> Hidden:
         """The unseen cells on each tube, of both models. Without `brake` the last tube is braking's own.
@@ -79,11 +89,14 @@ class Sight:
         Where braking touches nothing unseen nothing else may, and only `wide` is counted.
         """
         leg = tube.stop_m - tube.turn_m
-        x, y = (tube.turn_m[..., axis, None] + leg[..., axis, None] * self._shares for axis in (0, 1))
-        wide = view.free.unseen(x, y, view.near_m, view.now_s, wide=True).max(axis=(0, 2))
+        if view.all_seen(tube.turn_m, tube.turn_m + leg):  # the usual case
+            none = np.zeros(leg.shape[1], dtype=np.intp)
+            return Hidden(none, none, np.zeros(none.shape))
+        along = leg.transpose(2, 0, 1)[:2, :, :, None] * self._shares
+        places = tube.turn_m.transpose(2, 0, 1)[:2, :, :, None] + along
+        wide = view.unseen(places, wide=True).max(axis=(0, 2))
         if (wide if brake is None else brake.wide)[-1] == 0:
             return Hidden(wide, wide, np.zeros(wide.shape))
-        exact = view.free.unseen(x, y, view.near_m, view.now_s, wide=False).max(axis=(0, 2))
-        stop_x, stop_y = tube.stop_m[..., 0].reshape(-1), tube.stop_m[..., 1].reshape(-1)
-        gaps = view.free.gap_m(stop_x, stop_y, view.near_m, view.now_s).reshape(2, -1).min(axis=0)
-        return Hidden(wide, exact, gaps)
+        exact = view.unseen(places, wide=False).max(axis=(0, 2))
+        stops = tube.stop_m.reshape(-1, 3).T[:2]
+        return Hidden(wide, exact, view.free.gap_m(stops, view.near_m, view.now_s).reshape(2, -1).min(axis=0))
