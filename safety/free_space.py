@@ -246,9 +246,9 @@ class _ViewTemplate:
     def _fill_minima(self, reach_m: Floats) -> None:
         """Row k: the shortest reach within 2^k beams on either side, over three turns so that no index wraps."""
         table, count = self._minima, min(reach_m.shape[0], self._turn)
-        circle = np.zeros(self._turn)
-        circle[:count] = reach_m[:count]
-        around = np.concatenate((circle, circle, circle)).astype(np.float32)
+        turns = np.zeros((3, self._turn), dtype=np.float32)
+        turns[:, :count] = reach_m[:count]
+        around = turns.reshape(-1)
         np.minimum(np.minimum(around[:-2], around[2:]), around[1:-1], out=table[0, 1:-1])
         for k in range(1, table.shape[0]):
             step = 1 << (k - 1)
