@@ -101,7 +101,8 @@ def allowance(
         asked = due >= 0.0
         normals, due = normals[:, asked], due[asked]
         due = _as_pushed(due, normals, push)
-    sink, climb = (_vertical_bound(float(room_m), config) for room_m in fence_m[-2:])
+    gain_s = stop_gain_s(config)
+    sink, climb = (_vertical_bound(room_m, gain_s, config) for room_m in fence_m[-2:].tolist())
     return Allowance(
         clearance_m=np.minimum(clear_m, max(min(0.0, worst), slide)),
         fence_m=np.minimum(0.0, fence_m),
@@ -172,11 +173,11 @@ def _strongest_per_sector(normals: Floats, due_m_s: Floats) -> NDArray[np.intp]:
     return strongest[strongest >= 0]
 
 
-def _vertical_bound(room_m: float, config: SafetyConfig) -> float:
+def _vertical_bound(room_m: float, gain_s: float, config: SafetyConfig) -> float:
     """Greatest command towards floor or ceiling: the stop point reaches it at most; beyond it, back inwards (negative)."""
     depth = -room_m - SLIDE_SHARE * config.margin_m
     inward = float(_fence_hold_off_m_s(np.array(depth), config)) if depth > 0.0 else 0.0
-    return -inward if inward > 0.0 else max(room_m, 0.0) / stop_gain_s(config)
+    return -inward if inward > 0.0 else max(room_m, 0.0) / gain_s
 
 
 def _fence_hold_off_m_s(depth_m: Floats, config: SafetyConfig) -> Floats:
