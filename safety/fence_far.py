@@ -55,7 +55,7 @@ class FarInside:
         for segments, room, vertex in zip((fence.edges, fence.vertices), rooms, (False, True), strict=True):
             few = segments.taken(room <= most)
             columns = (few.x_m, few.y_m, few.ux, few.uy, few.length_m, few.erosion_m)
-            pieces += [_Piece(*numbers, vertex) for numbers in zip(*(column.tolist() for column in columns), strict=True)]
+            pieces += [_Piece(*numbers, vertex=vertex) for numbers in zip(*(column.tolist() for column in columns), strict=True)]
         return FarInside(*place, float(measured.edge_m[row].min()), tuple(pieces))
 
     def clear_of(self, distance_m: float, place: Vertex) -> bool:
