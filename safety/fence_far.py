@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from safety.fence import Measured, PolygonFence, Vertex
 
 WITHIN_M = 0.5
@@ -55,7 +57,8 @@ class FarInside:
         for segments, room, vertex in zip((fence.edges, fence.vertices), rooms, (False, True), strict=True):
             few = segments.taken(room <= most)
             columns = (few.x_m, few.y_m, few.ux, few.uy, few.length_m, few.erosion_m)
-            pieces += [_Piece(*numbers, vertex=vertex) for numbers in zip(*(column.tolist() for column in columns), strict=True)]
+            for x, y, ux, uy, length, erosion in np.stack(columns, axis=1).tolist():
+                pieces.append(_Piece(x, y, ux, uy, length, erosion, vertex))
         return FarInside(*place, float(measured.edge_m[row].min()), tuple(pieces))
 
     def clear_of(self, distance_m: float, place: Vertex) -> bool:
