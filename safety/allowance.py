@@ -100,17 +100,21 @@ def allowance(
     normals, due = _outward(tube, clear_m, points_m, position_m, config)
     if ways is not None:
         normals, due = np.concatenate((normals, ways.normals), axis=1), np.concatenate((due, _fence_due_m_s(ways, config)))
-    push = _way_out_m_s(normals, due, config)
-    asked = due >= 0.0
-    normals, due = normals[:, asked], due[asked]
-    sink, climb = _vertical_bounds(fence_m[-2:], config)
+    push: Floats = np.zeros(2)
+    if due.shape[0]:
+        push = _way_out_m_s(normals, due, config)
+        asked = due >= 0.0
+        normals, due = normals[:, asked], due[asked]
+        due = _as_pushed(due, normals, push)
+    gain_s = stop_gain_s(config)
+    sink, climb = (_vertical_bound(room_m, gain_s, config) for room_m in fence_m[-2:].tolist())
     return Allowance(
         clearance_m=np.minimum(clear_m, max(min(0.0, worst), slide)),
         fence_m=np.minimum(0.0, fence_m),
         normals=normals,
-        outward_m_s=_as_pushed(due, normals, push),
+        outward_m_s=due,
         push_m_s=push,
-        sink_m_s=sink,
+        sink_m_s=-sink,
         climb_m_s=climb,
         brake_stop_m=tube.stop_m[:, -1],
     )
@@ -126,6 +130,8 @@ def _outward(tube: Tubes, clear_m: Floats, points_m: Floats, position_m: Floats,
 
     Positive: it comes too near; zero: onto the point; negative: there is room, but the way out of another may not use up more.
     """
+    if clear_m.shape[0] == 0:
+        return _NO_NORMALS, _NO_SPEEDS
     slide = SLIDE_SHARE * config.margin_m
     here = points_m - position_m[:, None]
     depth_here = config.keep_out_m - slide - np.sqrt((here * here).sum(axis=0))
@@ -172,12 +178,11 @@ def _strongest_per_sector(normals: Floats, due_m_s: Floats) -> NDArray[np.intp]:
     return strongest[strongest >= 0]
 
 
-def _vertical_bounds(room_m: Floats, config: SafetyConfig) -> tuple[float, float]:
-    """Least and greatest vertical command: the stop point reaches floor or ceiling at most; beyond it, back inwards."""
+def _vertical_bound(room_m: float, gain_s: float, config: SafetyConfig) -> float:
+    """Greatest command towards floor or ceiling: the stop point reaches it at most; beyond it, back inwards (negative)."""
     depth = -room_m - SLIDE_SHARE * config.margin_m
-    inward = np.where(depth > 0.0, _fence_hold_off_m_s(depth, config), 0.0)
-    bound = np.where(inward > 0.0, -inward, np.maximum(room_m, 0.0) / stop_gain_s(config))
-    return -float(bound[0]), float(bound[1])
+    inward = float(_fence_hold_off_m_s(np.array(depth), config)) if depth > 0.0 else 0.0
+    return -inward if inward > 0.0 else max(room_m, 0.0) / gain_s
 
 
 def _fence_hold_off_m_s(depth_m: Floats, config: SafetyConfig) -> Floats:

@@ -7,6 +7,7 @@ crossings on the whole way from the start of control. Only where something is ou
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from safety.braking import Start, Tubes
 from safety.fence import Booleans, PolygonFence, Segments
+from safety.fence_far import FarInside
 from safety.frames import CorridorVector
 
 Floats = NDArray[np.float64]
@@ -24,12 +26,14 @@ _LEAST_M2 = 1e-12
 class NearFence:
     """The part of the fence that matters this tick. `room_m`: the vehicle now, beyond the erosion, negative where too near.
 
-    `edges` [e], `vertices` [e]: within reach. `outside`: control begins on the forbidden side of some polygon.
+    `edges` [e], `vertices` [e]: within reach; `pieces` [2 e]: both. `outside`: control begins on the forbidden side of some
+    polygon.
     """
 
     room_m: float
     edges: Segments
     vertices: Segments
+    pieces: Segments
     outside: bool
 
 
@@ -41,30 +45,49 @@ class WaysOut:
     room_m: Floats
 
 
+NO_WAYS = WaysOut(np.empty((2, 0)), np.empty(0))
+
+
 class FenceGuard:
     """An eroded fence between two heights, asked about brake tubes."""
 
     def __init__(self, fence: PolygonFence, low_z_m: float, high_z_m: float) -> None:
         self._fence, self._low_z, self._high_z = fence, low_z_m, high_z_m
+        self._corner_m = float(fence.vertices.erosion_m[0])
+        self._nothing = self._take(np.zeros(fence.edges.length_m.shape, dtype=np.bool_))
+        self._taken, self._taken_key = self._nothing, b""
+        self._far: FarInside | None = None
 
     def look(self, position: CorridorVector, start: Start, reach_m: float) -> NearFence:
         """Take what tubes from `start` can come near to when they reach `reach_m`, and all of a polygon already breached."""
-        fence = self._fence
-        places = np.array(((position.x, position.y), start.position_m[0, :2], start.position_m[1, :2]))
-        measured = fence.measured(places)
-        sideways = float(measured.room_m(fence)[0])
-        room = min(sideways, position.z - self._low_z, self._high_z - position.z)
-        near = measured.edge_m[1:].min(axis=0) < reach_m + fence.vertices.erosion_m[0]
+        fence, place, within_m = self._fence, (position.x, position.y), reach_m + self._corner_m
+        upright = min(position.z - self._low_z, self._high_z - position.z)
+        begins = start.position_m[:, :2].tolist()
+        far_m = within_m + max(math.dist(place, begin) for begin in begins)
+        if self._far is not None and self._far.clear_of(far_m, place):
+            return NearFence(min(self._far.room_m(place), upright), *self._nothing, outside=False)
+        measured = fence.measured(np.array((place, *begins)))
+        if measured.edge_m[0].min() > far_m and measured.margin_m[0].min() > 0.0:
+            self._far = FarInside.at(place, measured, 0, fence)
+        room = min(float(measured.room_m(fence)[0]), upright)
+        near = measured.edge_m[1:].min(axis=0) < within_m
         breached = measured.margin_m[1:].min(axis=0) < 0.0
         outside = bool(breached.any())
         if outside:
             near |= breached[fence.edges.ring]
-        return NearFence(room, fence.edges.taken(near), fence.vertices.taken(near), outside)
+        if near.tobytes() != self._taken_key:  # mostly the same pieces as a tick ago: kept
+            self._taken, self._taken_key = self._take(near), near.tobytes()
+        return NearFence(room, *self._taken, outside)
+
+    def _take(self, near: Booleans) -> tuple[Segments, Segments, Segments]:
+        """Some edges, their first vertices, and both."""
+        edges, vertices = self._fence.edges.taken(near), self._fence.vertices.taken(near)
+        return edges, vertices, edges.followed_by(vertices)
 
     def rooms_m(self, tube: Tubes, start: Start, near: NearFence) -> Floats:
         """Least room beyond the erosion of tubes at each near edge and vertex, then floor and ceiling, [c, 2 e + 2], m."""
         z = np.concatenate((tube.turn_m[..., 2], tube.stop_m[..., 2]))
-        heights = np.stack((z.min(axis=0) - self._low_z, self._high_z - z.max(axis=0)), axis=1)
+        heights = np.array((z.min(axis=0) - self._low_z, self._high_z - z.max(axis=0))).T
         if near.edges.length_m.shape[0] == 0:
             return heights
         return np.concatenate((self._sideways_m(tube, start, near), heights), axis=1)
@@ -76,14 +99,14 @@ class FenceGuard:
         to_vertices = _leg_to_vertices_m(ends, near.vertices)
         crossed = _crossed(edges, along, across, start)
         distance = np.concatenate((np.where(crossed, 0.0, to_edges), to_vertices), axis=-1).min(axis=0)
-        rooms: Floats = distance - np.concatenate((edges.erosion_m, near.vertices.erosion_m))
+        rooms: Floats = distance - near.pieces.erosion_m
         if near.outside or crossed.any():
             return self._with_depths(rooms, ends, near)
         return rooms
 
     def _with_depths(self, rooms: Floats, ends: Floats, near: NearFence) -> Floats:
         """Rooms where a tube's leg may end outside: a breached polygon counts by its depth alone, at all its edges alike."""
-        pieces = near.edges.followed_by(near.vertices)
+        pieces = near.pieces
         depth = self._fence.ring_margins_m(ends).min(axis=(0, 1))[:, pieces.ring]
         signed: Floats = np.where(depth < 0.0, depth - pieces.erosion_m, rooms)
         return signed
@@ -93,8 +116,10 @@ class FenceGuard:
 
         Of a polygon that is breached there, only the nearest piece counts.
         """
+        pieces = near.pieces
+        if pieces.length_m.shape[0] == 0:
+            return NO_WAYS
         points = np.concatenate((tube.turn_m[:, -1, :2], tube.stop_m[:, -1, :2]))
-        pieces = near.edges.followed_by(near.vertices)
         along, across = pieces.along_across(points[:, 0], points[:, 1])
         distance = pieces.distances_m(along, across)
         breached = (self._fence.ring_margins_m(points) < 0.0)[:, pieces.ring]

@@ -9,8 +9,6 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import numpy as np
-
 from safety.braking import CommandHistory, predict_start
 from safety.caps import cap_speed
 from safety.config import SafetyConfig
@@ -128,7 +126,7 @@ class SafetyFilter:
             self._free.update(self._seen)
         x, y, extra = self._memory.points(now_s, self.config)
         start = predict_start(state, self._history, now_s, self.config)
-        return Surroundings(x, y, extra, View(self._free, np.array((x, y)), now_s), state.position, start)
+        return Surroundings(x, y, extra, View(self._free, self._memory.places_m, now_s), state.position, start)
 
     def _dt_s(self, now_s: float) -> float:
         """Time since the last command, bounded so that a pause allows no jump."""

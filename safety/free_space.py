@@ -8,6 +8,8 @@ Obstacles count as columns, so the map is flat. With moving obstacles the unseen
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +20,7 @@ from safety.lidar import SeenScan
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 Booleans = NDArray[np.bool_]
+Window = tuple[int, int, int, int]  # of cells: the first ones, and those after the last
 
 CELL_M = 0.1
 SIDE_CELLS = 128
@@ -27,9 +30,51 @@ SURFACE_CELLS = 2  # cells this near to a known return belong to it
 TAKE_OFF_M = 0.9  # at engaging nothing may stand nearer to the vehicle's centre than this, unseen by the LiDAR
 VICINITY_CELLS = 2  # around the swept hull: what is known there stays known while the vehicle stands
 STEP_M = 0.2  # between the discs that stand for a swept hull
+PATCH_CELLS = 10  # a patch is made so much wider than what is asked first: the tubes of a tick lie close together
 _REACH_ERROR_M = CELL_M * math.sqrt(2.0)  # of a cell's far corner, seen from anywhere in the cell of the LiDAR
 _WIDEST_RAD = math.radians(60.0)  # nearer cells fill more of the view: they are the vehicle's own
 NOWHERE = np.empty((2, 0))
+
+
+@dataclass(slots=True)
+class _Patch:
+    """The unseen cells of a window of the map at one moment. Every tube of a tick asks here, so sums are made once.
+
+    `low_x`, `low_y`: its first cell. `counts`: per kernel, what the hull would touch with its centre in each cell. `spared`: the
+    same without the cells that the hull touches at some places, and those places.
+    """
+
+    near_m: Floats
+    low_x: int
+    low_y: int
+    hidden: Booleans
+    counts: dict[bool, Integers] = field(default_factory=dict)
+    spared: tuple[Floats, _Patch] | None = None
+
+    def holds(self, low_x: int, low_y: int, high_x: int, high_y: int, near_m: Floats) -> bool:
+        """Whether it was made for the same returns and is large enough."""
+        rows, columns = self.hidden.shape
+        inside = low_x >= self.low_x and low_y >= self.low_y and high_x <= self.low_x + rows and high_y <= self.low_y + columns
+        return inside and near_m is self.near_m
+
+    def sparing(self, places_m: Floats, boxes: Integers) -> _Patch:
+        """The patch without the cells of the boxes around places [2, n]."""
+        if self.spared is None or self.spared[0] is not places_m:
+            hidden, cells = self.hidden.copy(), _cells(places_m)
+            _clear(hidden, boxes, cells[0] - self.low_x, cells[1] - self.low_y)
+            self.spared = (places_m, _Patch(self.near_m, self.low_x, self.low_y, hidden))
+        return self.spared[1]
+
+    def part(self, low_x: int, low_y: int, high_x: int, high_y: int) -> Booleans:
+        """The unseen cells of a smaller window."""
+        return self.hidden[low_x - self.low_x : high_x - self.low_x, low_y - self.low_y : high_y - self.low_y]
+
+    def counted(self, cells: Integers, boxes: Integers, rim: int, wide: bool) -> Integers:
+        """The weighted sums of a kernel's boxes at cells [2, ...]."""
+        if wide not in self.counts:
+            self.counts[wide] = _box_counts(self.hidden, boxes, rim)
+        found: Integers = self.counts[wide][cells[0] - (self.low_x + rim), cells[1] - (self.low_y + rim)]
+        return found
 
 
 class FreeSpace:
@@ -42,7 +87,8 @@ class FreeSpace:
         self._spare = np.empty_like(self._seen_s)
         hull = config.vehicle_radius_m + config.position_error_m + config.velocity_error_m_s * config.delay_s + _sagitta_m(config)
         self._kernels = (_boxes(hull + CELL_M), _boxes(hull))
-        self._rim = int(self._kernels[0].max())
+        self._rims = tuple(int(boxes.max()) for boxes in self._kernels)
+        self._rim = self._rims[0]
         self._hull = _disc(config.vehicle_radius_m)
         self._vicinity = _disc(hull + (1 + VICINITY_CELLS) * CELL_M)
         self.clear()
@@ -50,16 +96,19 @@ class FreeSpace:
     def clear(self) -> None:
         """Nothing was ever seen."""
         self._seen_s.fill(-np.inf)
+        self._patches: dict[float, _Patch] = {}
         self._corner = (0, 0)
         self._began_s: float | None = None
         self._shrunk_s = 0.0
 
     def forget(self) -> None:
         """Nothing is known any more, in flight: unlike at engaging, nothing is taken for granted around the vehicle."""
+        self._patches.clear()
         self._seen_s.fill(-np.inf)
 
     def update(self, seen: SeenScan) -> None:
         """Take in a scan: what its beams went through, and where the vehicle is."""
+        self._patches.clear()
         if self._began_s is None:
             self._began_s, self._shrunk_s = seen.time_s, seen.time_s
             self._corner = (_cell(seen.origin_x_m) - SIDE_CELLS // 2, _cell(seen.origin_y_m) - SIDE_CELLS // 2)
@@ -103,76 +152,75 @@ class FreeSpace:
                 np.minimum(grid[:-1], grid[1:], out=self._spare[:-1])
                 np.minimum(self._spare[:-2], grid[2:], out=grid[1:-1])
 
-    def unseen(self, x_m: Floats, y_m: Floats, near_m: Floats, now_s: float, wide: bool, spared_m: Floats = NOWHERE) -> Integers:
-        """How many unseen cells the hull touches with its centre at x, y [...]; weighted, 0 = none.
+    def unseen(self, places_m: Floats, near_m: Floats, now_s: float, wide: bool, spared_m: Floats = NOWHERE) -> Integers:
+        """How many unseen cells the hull touches with its centre at places [2, ...]; weighted, 0 = none.
 
         The hull with its errors, one cell more when `wide`. `near_m` [2, k]: known returns, whose surroundings count as known.
         `spared_m` [2, n]: cells that the hull touches with its centre there do not count.
         """
-        boxes = self._kernels[0 if wide else 1]
-        rim = int(boxes.max())
-        ix, iy = self._indices(x_m, 0), self._indices(y_m, 1)
-        low_x, low_y = int(ix.min()) - rim, int(iy.min()) - rim
-        hidden = self._hidden(low_x, low_y, int(ix.max()) + rim + 1, int(iy.max()) + rim + 1, near_m, now_s)
-        if hidden is None:
-            return np.full(x_m.shape, SIDE_CELLS * SIDE_CELLS, dtype=np.intp)
-        _clear(hidden, boxes, self._indices(spared_m[0], 0) - low_x, self._indices(spared_m[1], 1) - low_y)
-        if not hidden.any():
-            return np.zeros(x_m.shape, dtype=np.intp)
-        counts: Integers = _box_counts(hidden, boxes, rim)[ix - (low_x + rim), iy - (low_y + rim)]
-        return counts
+        kernel = 0 if wide else 1
+        boxes, rim = self._kernels[kernel], self._rims[kernel]
+        cells = _cells(places_m)
+        window = _window(cells, rim)
+        patch = self._patch_of(window, near_m, now_s)
+        if patch is None:
+            return np.full(places_m.shape[1:], SIDE_CELLS * SIDE_CELLS, dtype=np.intp)
+        if spared_m.shape[1]:
+            patch = patch.sparing(spared_m, boxes)
+        if not patch.part(*window).any():
+            return np.zeros(places_m.shape[1:], dtype=np.intp)
+        return patch.counted(cells, boxes, rim, wide)
 
     def all_seen_around(self, x_m: float, y_m: float, now_s: float) -> bool:
         """Whether every cell that the hull could touch around a place was seen: quick, and False where it must be counted."""
-        i, j, rim = _cell(x_m) - self._corner[0], _cell(y_m) - self._corner[1], self._rim
-        if min(i, j) < rim or max(i, j) >= SIDE_CELLS - rim or self._began_s is None:
+        return self.all_seen_between((x_m, y_m), (x_m, y_m), now_s)
+
+    def all_seen_between(self, low_m: Sequence[float], high_m: Sequence[float], now_s: float) -> bool:
+        """The same for all places of a rectangle between two corners (x, y)."""
+        (left, below), (right, above), rim = self._corner_cells(low_m), self._corner_cells(high_m), self._rim
+        if min(left, below) < rim or max(right, above) >= SIDE_CELLS - rim or self._began_s is None:
             return False
-        around = self._seen_s[i - rim : i + rim + 1, j - rim : j + rim + 1]
+        around = self._seen_s[left - rim : right + rim + 1, below - rim : above + rim + 1]
         return bool(around.min() >= now_s - self._began_s - self._config.memory_s)
 
-    def gap_m(self, x_m: Floats, y_m: Floats, near_m: Floats, now_s: float) -> Floats:
-        """Distance from places x, y [n] to the nearest unseen cell, m; what is further than the hull needs reads as that."""
+    def gap_m(self, places_m: Floats, near_m: Floats, now_s: float) -> Floats:
+        """Distance from places [2, n] to the nearest unseen cell, m; what is further than the hull needs reads as that."""
         rim = self._rim
-        ix, iy = self._indices(x_m, 0), self._indices(y_m, 1)
-        low_x, low_y = int(ix.min()) - rim, int(iy.min()) - rim
-        hidden = self._hidden(low_x, low_y, int(ix.max()) + rim + 1, int(iy.max()) + rim + 1, near_m, now_s)
-        if hidden is None:
-            return np.zeros(x_m.shape)
-        i, j = np.nonzero(hidden)
-        dx = np.abs(x_m[:, None] - CELL_M * (i + (low_x + self._corner[0] + 0.5))) - 0.5 * CELL_M
-        dy = np.abs(y_m[:, None] - CELL_M * (j + (low_y + self._corner[1] + 0.5))) - 0.5 * CELL_M
+        window = _window(_cells(places_m), rim)
+        patch = self._patch_of(window, near_m, now_s)
+        if patch is None:
+            return np.zeros(places_m.shape[1])
+        i, j = np.nonzero(patch.part(*window))
+        dx = np.abs(places_m[0, :, None] - CELL_M * (i + (window[0] + 0.5))) - 0.5 * CELL_M
+        dy = np.abs(places_m[1, :, None] - CELL_M * (j + (window[1] + 0.5))) - 0.5 * CELL_M
         gaps: Floats = np.hypot(np.maximum(dx, 0.0), np.maximum(dy, 0.0)).min(axis=1, initial=rim * CELL_M)
         return gaps
 
-    def _indices(self, places_m: Floats, axis: int) -> Integers:
-        cells: Integers = np.floor(places_m / CELL_M).astype(np.intp) - self._corner[axis]
-        return cells
+    def _corner_cells(self, place_m: Sequence[float]) -> tuple[int, int]:
+        return _cell(place_m[0]) - self._corner[0], _cell(place_m[1]) - self._corner[1]
 
-    def _hidden(self, low_x: int, low_y: int, high_x: int, high_y: int, near_m: Floats, now_s: float) -> Booleans | None:
-        """The unseen cells of a window of the map that belong to no known return; None for a window that is not on the map."""
-        if min(low_x, low_y) < 0 or max(high_x, high_y) > SIDE_CELLS or self._began_s is None:
+    def _patch_of(self, window: Window, near_m: Floats, now_s: float) -> _Patch | None:
+        """A patch of the map that holds a window (one of this tick when it does); None for a window that is not on the map."""
+        (left, below), (low_x, low_y, high_x, high_y) = self._corner, window
+        right, above = left + SIDE_CELLS, below + SIDE_CELLS
+        if low_x < left or low_y < below or high_x > right or high_y > above or self._began_s is None:
             return None
-        oldest_s = now_s - self._began_s - self._config.memory_s
+        patch = self._patches.get(now_s)
+        if patch is None or not patch.holds(*window, near_m):
+            low_x, low_y = max(low_x - PATCH_CELLS, left), max(low_y - PATCH_CELLS, below)
+            high_x, high_y = min(high_x + PATCH_CELLS, right), min(high_y + PATCH_CELLS, above)
+            oldest_s = now_s - self._began_s - self._config.memory_s
+            hidden = self._hidden(low_x - left, low_y - below, high_x - left, high_y - below, near_m, oldest_s)
+            patch = _Patch(near_m, low_x, low_y, hidden)
+            self._patches = {moment: old for moment, old in self._patches.items() if old.near_m is near_m} | {now_s: patch}
+        return patch
+
+    def _hidden(self, low_x: int, low_y: int, high_x: int, high_y: int, near_m: Floats, oldest_s: float) -> Booleans:
+        """The unseen cells of a window of the map that belong to no known return."""
         hidden: Booleans = self._seen_s[low_x:high_x, low_y:high_y] < oldest_s
         if near_m.shape[1] and hidden.any():
-            hidden &= ~self._surfaces(near_m, low_x, low_y, hidden.shape)
+            hidden &= ~_surfaces(near_m, low_x + self._corner[0], low_y + self._corner[1], hidden.shape)
         return hidden
-
-    def _surfaces(self, near_m: Floats, low_x: int, low_y: int, shape: tuple[int, ...]) -> Booleans:
-        """Cells of a window that belong to known returns."""
-        border = SURFACE_CELLS
-        mask = np.zeros((shape[0] + 2 * border, shape[1] + 2 * border), dtype=np.bool_)
-        ix = self._indices(near_m[0], 0) - (low_x - border)
-        iy = self._indices(near_m[1], 1) - (low_y - border)
-        inside = (ix >= 0) & (iy >= 0) & (ix < mask.shape[0]) & (iy < mask.shape[1])
-        mask[ix[inside], iy[inside]] = True
-        rows = mask[: shape[0]].copy()
-        for k in range(1, 2 * border + 1):
-            rows |= mask[k : k + shape[0]]
-        grown = rows[:, : shape[1]].copy()
-        for k in range(1, 2 * border + 1):
-            grown |= rows[:, k : k + shape[1]]
-        return grown
 
 
 class _ViewTemplate:
@@ -213,9 +261,9 @@ class _ViewTemplate:
     def _fill_minima(self, reach_m: Floats) -> None:
         """Row k: the shortest reach within 2^k beams on either side, over three turns so that no index wraps."""
         table, count = self._minima, min(reach_m.shape[0], self._turn)
-        circle = np.zeros(self._turn)
-        circle[:count] = reach_m[:count]
-        around = np.concatenate((circle, circle, circle)).astype(np.float32)
+        turns = np.zeros((3, self._turn), dtype=np.float32)
+        turns[:, :count] = reach_m[:count]
+        around = turns.reshape(-1)
         np.minimum(np.minimum(around[:-2], around[2:]), around[1:-1], out=table[0, 1:-1])
         for k in range(1, table.shape[0]):
             step = 1 << (k - 1)
@@ -240,6 +288,37 @@ def _reaches(seen: SeenScan, config: SafetyConfig) -> Floats:
         reach[:edge] = 0.0
         reach[reach.shape[0] - edge :] = 0.0
     return reach
+
+
+def _surfaces(near_m: Floats, low_x: int, low_y: int, shape: tuple[int, ...]) -> Booleans:
+    """Cells of a window, whose first cell is given, that belong to known returns."""
+    border = SURFACE_CELLS + 1  # what is further out than the border lands in its outermost cells, and those are left off
+    mask = np.zeros((shape[0] + 2 * border, shape[1] + 2 * border), dtype=np.bool_)
+    cells = _cells(near_m)
+    ix = np.minimum(np.maximum(cells[0] - (low_x - border), 0), mask.shape[0] - 1)
+    iy = np.minimum(np.maximum(cells[1] - (low_y - border), 0), mask.shape[1] - 1)
+    mask[ix, iy] = True
+    return _widened(_widened(mask[1:-1, 1:-1]).T).T
+
+
+def _widened(mask: Booleans) -> Booleans:
+    """Rows, less a border of `SURFACE_CELLS` on either side, in which a cell is set when one within the border's width was."""
+    twice = mask[:-1] | mask[1:]
+    four = twice[:-2] | twice[2:]
+    return four[:-1] | mask[4:]
+
+
+def _cells(places_m: Floats) -> Integers:
+    """The cells [2, ...] in which places [2, ...] lie."""
+    cells: Integers = np.floor(places_m / CELL_M).astype(np.intp)
+    return cells
+
+
+def _window(cells: Integers, rim: int) -> Window:
+    """All that the hull could touch with its centre in cells [2, ...]."""
+    flat = cells.reshape(2, -1)
+    (low_x, low_y), (high_x, high_y) = flat.min(axis=1).tolist(), flat.max(axis=1).tolist()
+    return low_x - rim, low_y - rim, high_x + rim + 1, high_y + rim + 1
 
 
 def _cell(metres: float) -> int:
@@ -286,10 +365,10 @@ def _clear(hidden: Booleans, boxes: Integers, i: Integers, j: Integers) -> None:
 def _box_counts(hidden: Booleans, boxes: Integers, rim: int) -> Integers:
     """Sum over the boxes of the hidden cells inside, for each middle cell at least `rim` from the border."""
     total = np.zeros((hidden.shape[0] + 1, hidden.shape[1] + 1), dtype=np.intp)
-    np.cumsum(np.cumsum(hidden, axis=0, dtype=np.intp), axis=1, out=total[1:, 1:])
+    hidden.cumsum(axis=0, dtype=np.intp).cumsum(axis=1, out=total[1:, 1:])
     rows, columns = hidden.shape[0] - 2 * rim, hidden.shape[1] - 2 * rim
     counts = np.zeros((rows, columns), dtype=np.intp)
-    for a, b in boxes:
+    for a, b in boxes.tolist():
         top, bottom = slice(rim - a, rim - a + rows), slice(rim + a + 1, rim + a + 1 + rows)
         left, right = slice(rim - b, rim - b + columns), slice(rim + b + 1, rim + b + 1 + columns)
         counts += total[bottom, right] - total[top, right]

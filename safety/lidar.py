@@ -115,9 +115,11 @@ def see(scan: LidarScan, state: VehicleState, table: BeamTable, config: SafetyCo
     level = np.sqrt(ahead * ahead + left * left)
     free = np.minimum(ranges, np.minimum(scan.range_max_m, TILT_BAND_M / np.maximum(np.abs(up), _LEVEL))) * level
     hit = np.isfinite(ranges)
-    ground = hit & (z + np.where(hit, ranges, 0.0) * up < config.ground_z_m + config.ground_band_m)
-    ranges[ground] = np.nan
-    hit &= ~ground
+    ground_m = config.ground_z_m + config.ground_band_m
+    if z + (scan.range_max_m + RANGE_SLACK_M) * min(float(up.min()), 0.0) < ground_m:  # else no beam can reach it
+        ground = hit & (z + np.where(hit, ranges, 0.0) * up < ground_m)
+        ranges[ground] = np.nan
+        hit &= ~ground
     reach, cos, sin = ranges[hit], math.cos(yaw), math.sin(yaw)
     dx, dy = reach * ahead[hit], reach * left[hit]
     return SeenScan(

@@ -55,9 +55,9 @@ def within_limits(candidates_m_s: Floats, last: LastSent, dt_s: float, config: S
     change = added - _towards(added, last.acceleration, dt_s)
     slow = np.hypot(candidates_m_s[:, 0], candidates_m_s[:, 1]) <= config.max_horizontal_speed_m_s + ROUNDING_M_S
     level = np.abs(candidates_m_s[:, 2]) <= config.max_vertical_speed_m_s
-    grown = np.linalg.norm(added, axis=1) <= config.max_acceleration_m_s2 * dt_s + ROUNDING_M_S
+    grown = np.sqrt((added * added).sum(axis=1)) <= config.max_acceleration_m_s2 * dt_s + ROUNDING_M_S
     within: NDArray[np.bool_] = slow & level & grown & (
-        np.linalg.norm(change, axis=1) <= config.max_jerk_m_s3 * dt_s * dt_s + ROUNDING_M_S
+        np.sqrt((change * change).sum(axis=1)) <= config.max_jerk_m_s3 * dt_s * dt_s + ROUNDING_M_S
     )  # fmt: skip
     return within
 
@@ -66,7 +66,7 @@ def _towards(points: Floats, end: CorridorVector, scale: float) -> Floats:
     """The places nearest to points [c, 3] on the straight way from zero to `end` times `scale`."""
     way = scale * np.array((end.x, end.y, end.z))
     share = points @ way / max(float(way @ way), ROUNDING_M_S**2)
-    nearest: Floats = np.clip(share, 0.0, 1.0)[:, None] * way
+    nearest: Floats = np.minimum(np.maximum(share, 0.0), 1.0)[:, None] * way
     return nearest
 
 

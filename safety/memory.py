@@ -72,6 +72,11 @@ class ObstacleMemory:
         reach: Floats = np.where(inside, seen.range_m[np.where(inside, beam, 0.0).astype(np.intp)], np.nan)
         return reach
 
+    @property
+    def places_m(self) -> Floats:
+        """Coordinates [2, k] of the points; they change with the next update, m."""
+        return self._points[:2, : self._count]
+
     def points(self, now_s: float, config: SafetyConfig) -> tuple[Floats, Floats, Floats]:
         """Coordinates x, y [k] and the extra radius [k] each point has by beam width, age, drift and own motion, m."""
         x, y, spread, time_s = self._points[:, : self._count]

@@ -227,7 +227,7 @@ class InputMonitor:
         Once seen in motion it lasts until a scan differs: a vehicle that has braked must not fly on by a frozen picture.
         """
         if scan.time_s > self._scan_time_s:
-            same = self._ranges is not None and np.array_equal(scan.ranges_m, self._ranges) and self._shows_something(scan)
+            same = self._ranges is not None and _alike(scan.ranges_m, self._ranges) and self._shows_something(scan)
             self._frozen = self._frozen + 1 if same else 0
             self._ranges = scan.ranges_m.copy()
             self._scan_time_s = scan.time_s
@@ -239,6 +239,11 @@ class InputMonitor:
         if self._stuck:
             return Intervention("scan_frozen", float(self._frozen), float(FROZEN_SCANS))
         return None
+
+
+def _alike(first: NDArray[np.floating], second: NDArray[np.floating]) -> bool:
+    """Whether two scans are the same in every range; two unknown ranges are not the same."""
+    return first.shape == second.shape and bool((first == second).all())
 
 
 def _length(vector: CorridorVector) -> float:

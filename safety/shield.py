@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from safety.allowance import EPSILON_M, Allowance, allowance, held_in
 from safety.braking import Start, Tubes, slow_after_s, tubes
 from safety.config import SafetyConfig
-from safety.fence_tube import FenceGuard, NearFence
+from safety.fence_tube import FenceGuard, NearFence, WaysOut
 from safety.frames import CorridorVector
 from safety.messages import Intervention
 from safety.sight import Hidden, Sight, View
@@ -45,10 +45,13 @@ class Surroundings:
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What braking sets for all commands of a tick: clearances and speeds, and the unseen space on its way."""
+    """What braking sets for all commands of a tick: clearances and speeds, the unseen space on its way, its tube, and the ways
+    out of the fence's margins where it comes into any."""
 
     allowed: Allowance
     hidden: Hidden
+    brake: Tubes
+    ways: WaysOut | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +85,8 @@ class Shield:
         clearance, fence_margin = self._clearance_now(around), near.room_m
         around = self._within_reach(around, reach)
         limit = self._speed_limit(around, clearance, fence_margin)
-        first = np.array(((wanted.x, wanted.y, wanted.z), (0.0, 0.0, 0.0)))
+        first = np.zeros((2, 3))
+        first[0] = wanted.x, wanted.y, wanted.z
         speed = math.hypot(wanted.x, wanted.y)
         found = [Intervention("return_speed", speed, limit)] if speed > limit else []
         first = _capped(first, limit)
@@ -91,7 +95,7 @@ class Shield:
             return Decision(wanted, (), clearance, fence_margin)
         if passed and within_limits(first[:1])[0]:
             return Decision(_vector(first[0]), tuple(found), clearance, fence_margin)
-        candidates = _capped(self._held_in(first[0], around, near, bounds.allowed), limit)
+        candidates = _capped(self._held_in(first[0], around, near, bounds), limit)
         chosen = self._nearest(first[0], candidates[within_limits(candidates)], around, near, bounds)
         return Decision(_vector(chosen), tuple(found), clearance, fence_margin)
 
@@ -106,18 +110,20 @@ class Shield:
         if around.x_m.shape[0] == 0:
             return math.inf
         dx, dy = around.x_m - around.position.x, around.y_m - around.position.y
-        return math.sqrt(float(np.min(dx * dx + dy * dy))) - self._config.vehicle_radius_m
+        return math.sqrt(float((dx * dx + dy * dy).min())) - self._config.vehicle_radius_m
 
     def _reach_m(self, start: Start) -> float:
         """How far from `start` some tube of this tick can come, errors and keep-out included, m."""
         config = self._config
         fast = (
-            max(math.hypot(v[0], v[1]) for v in start.velocity_m_s)
+            max(math.hypot(x, y) for x, y, _ in start.velocity_m_s.tolist())
             + config.max_horizontal_speed_m_s * config.tick_s / config.lag_min_s
         )
-        apart = math.dist(start.position_m[0, :2], start.position_m[1, :2])
-        blind_s = config.dead_time_s + config.tick_s + float(slow_after_s(fast * config.lag_s, config))
-        errors = config.velocity_error_m_s * config.delay_s + config.obstacle_speed_m_s * blind_s
+        apart = math.dist(*start.position_m[:, :2].tolist())
+        errors = config.velocity_error_m_s * config.delay_s
+        if config.obstacle_speed_m_s > 0.0:
+            blind_s = config.dead_time_s + config.tick_s + float(slow_after_s(fast * config.lag_s, config))
+            errors += config.obstacle_speed_m_s * blind_s
         stop = config.stop_distance_m(fast + config.max_horizontal_speed_m_s * config.tick_s)
         return config.keep_out_m + apart + errors + stop
 
@@ -126,7 +132,9 @@ class Shield:
         start = around.start
         dx, dy = around.x_m - start.position_m[0, 0], around.y_m - start.position_m[0, 1]
         near = dx * dx + dy * dy < (reach_m + around.extra_m) ** 2
-        return Surroundings(around.x_m[near], around.y_m[near], around.extra_m[near], around.view, around.position, around.start)
+        which = near.nonzero()[0]
+        points = around.view.near_m[:, which]
+        return Surroundings(points[0], points[1], around.extra_m[which], around.view, around.position, around.start)
 
     def _judge(self, first: Floats, around: Surroundings, near: NearFence, found: list[Intervention]) -> tuple[bool, Bounds]:
         """Judge the wanted command (row 0) against what braking (row 1) sets."""
@@ -137,7 +145,8 @@ class Shield:
         ways = self._guard.ways_out(tube, near) if pressed else None
         allowed = allowance(tube, clear[1], fence[1], points, position, ways, self._config)
         hidden = self._sight.hidden(tube, around.view)
-        bounds = Bounds(allowed, hidden.rows(slice(1, 2)))
+        braking = slice(1, 2)
+        bounds = Bounds(allowed, hidden.rows(braking), tube.rows(braking), ways)
         if not allowed.permits(first[:1], clear[:1], fence[:1])[0]:
             found.extend(_reasons(allowed, first[0], clear[0], fence[0]))
             return False, bounds
@@ -146,12 +155,12 @@ class Shield:
             return False, bounds
         return True, bounds
 
-    def _held_in(self, wanted: Floats, around: Surroundings, near: NearFence, allowed: Allowance) -> Floats:
+    def _held_in(self, wanted: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Floats:
         """All candidates [c, 3], turned along the fence, neither climbing nor sinking out of it."""
-        brake = tubes(around.start, np.zeros((1, 3)), self._config)
-        ways = self._guard.ways_out(brake, near)
+        allowed = bounds.allowed
+        ways = self._guard.ways_out(bounds.brake, near) if bounds.ways is None else bounds.ways
         candidates = held_in(self._candidates(wanted, around, allowed), ways, allowed.push_m_s, self._config)
-        candidates[:, 2] = np.clip(candidates[:, 2], allowed.sink_m_s, allowed.climb_m_s)
+        np.clip(candidates[:, 2], allowed.sink_m_s, allowed.climb_m_s, out=candidates[:, 2])
         return candidates
 
     def _nearest(self, wanted: Floats, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Floats:
@@ -184,27 +193,34 @@ class Shield:
 
     def _candidates(self, wanted: Floats, around: Surroundings, allowed: Allowance) -> Floats:
         """Candidates [c, 3]: the wanted one, shorter, turned (length by cosine), slid along the nearest obstacle, hover."""
-        x, y, z = wanted
+        x, y, z = wanted.tolist()
         a, b = self._scaled[:, 0], self._scaled[:, 1]
-        still = np.array([[0.0, 0.0, z], [0.0, 0.0, 0.0]])
-        rows = [np.stack((a * x - b * y, a * y + b * x, np.full(a.shape, z)), axis=1), wanted[None], still]
-        if around.x_m.shape[0]:
-            rows += [self._slid(wanted, around, stop) for stop in allowed.brake_stop_m]
-        plain = np.concatenate(rows)
+        slid = 2 * len(OUTWARD) if around.x_m.shape[0] else 0
+        shorter = a.shape[0]
+        plain = np.empty((shorter + 3 + slid, 3))
+        plain[:, 2] = z
+        plain[:shorter, 0], plain[:shorter, 1] = a * x - b * y, a * y + b * x
+        plain[shorter], plain[shorter + 1, :2], plain[shorter + 2] = wanted, 0.0, 0.0
+        if slid:
+            plain[shorter + 3 :] = self._slid(wanted, around, allowed.brake_stop_m)
         push = allowed.push_m_s
         if not push.any():
             return plain
-        pushed = [plain + np.array((*(share * push), 0.0)) for share in PUSHES]
-        return np.concatenate((plain, *pushed))
+        pushed = np.concatenate((plain, plain, plain))
+        for k, share in enumerate(PUSHES, start=1):
+            pushed[k * plain.shape[0] : (k + 1) * plain.shape[0], :2] += share * push
+        return pushed
 
-    def _slid(self, wanted: Floats, around: Surroundings, stop_m: Floats) -> Floats:
-        """The wanted vector without its part towards the point nearest to where braking ends, [2, 3]."""
-        dx, dy = stop_m[0] - around.x_m, stop_m[1] - around.y_m
+    def _slid(self, wanted: Floats, around: Surroundings, stops_m: Floats) -> Floats:
+        """The wanted vector without its part towards the points nearest to where braking ends [2 models, 3], [2 x 2, 3]."""
+        dx, dy = stops_m[:, :1] - around.x_m, stops_m[:, 1:2] - around.y_m
         distance = np.hypot(dx, dy)
-        nearest = int(np.argmin(distance - around.extra_m))
-        normal = np.array((dx[nearest], dy[nearest], 0.0)) / max(float(distance[nearest]), EPSILON_M)
-        inward, length = min(0.0, float(wanted @ normal)), math.hypot(wanted[0], wanted[1])
-        return np.stack([wanted - (inward - share * length) * normal for share in OUTWARD])
+        length, rows = math.hypot(wanted[0], wanted[1]), []
+        for model, nearest in enumerate((distance - around.extra_m).argmin(axis=1)):
+            normal = np.array((dx[model, nearest], dy[model, nearest], 0.0)) / max(float(distance[model, nearest]), EPSILON_M)
+            inward = min(0.0, float(wanted @ normal))
+            rows += [wanted - (inward - share * length) * normal for share in OUTWARD]
+        return np.array(rows)
 
     def _tube_clearances(self, tube: Tubes, around: Surroundings) -> Floats:
         """Smallest distance beyond keep-out between each tube and each known point, [c, k], m."""
@@ -241,11 +257,13 @@ def _leg_clearances(tube: Tubes, error_m: float, grown_m: Floats | float, around
     `error_m`: at the leg's begin; `grown_m`: added at its end, one for all or [2 models x c, 1].
     """
     begin_m, end_m = tube.turn_m, tube.stop_m
+    if around.x_m.shape[0] == 0:
+        return np.empty((begin_m.shape[1], 0))
     ax, ay = begin_m[..., 0].reshape(-1, 1), begin_m[..., 1].reshape(-1, 1)
     dx, dy = end_m[..., 0].reshape(-1, 1) - ax, end_m[..., 1].reshape(-1, 1) - ay
     rx, ry = around.x_m - ax, around.y_m - ay
     along = (rx * dx + ry * dy) / np.maximum(dx * dx + dy * dy, 1e-12)
-    np.clip(along, 0.0, 1.0, out=along)
+    np.minimum(np.maximum(along, 0.0, out=along), 1.0, out=along)
     rx -= along * dx
     ry -= along * dy
     distance = np.sqrt(rx * rx + ry * ry)
@@ -259,6 +277,8 @@ def _leg_clearances(tube: Tubes, error_m: float, grown_m: Floats | float, around
 
 def _capped(candidates: Floats, limit_m_s: float) -> Floats:
     """Velocities [c, 3] whose horizontal part is shortened to a limit."""
+    if limit_m_s == math.inf:
+        return candidates
     speed = np.hypot(candidates[:, 0], candidates[:, 1])
     if not (speed > limit_m_s).any():
         return candidates

@@ -34,6 +34,15 @@ class View:
     near_m: Floats
     now_s: float
 
+    def unseen(self, places_m: Floats, wide: bool, ahead_s: float = 0.0, spared_m: Floats = NOWHERE) -> Integers:
+        """How many unseen cells the hull touches at places [2, ...], now or some time ahead."""
+        return self.free.unseen(places_m, self.near_m, self.now_s + ahead_s, wide, spared_m)
+
+    def all_seen(self, begin_m: Floats, end_m: Floats, ahead_s: float) -> bool:
+        """Whether all is seen around straight legs [..., 3]: quick, and False where it must be counted."""
+        ends = np.concatenate((begin_m, end_m)).reshape(-1, 3)
+        return self.free.all_seen_between(ends.min(axis=0).tolist(), ends.max(axis=0).tolist(), self.now_s + ahead_s)
+
 
 @dataclass(frozen=True, slots=True)
 class Hidden:
@@ -74,8 +83,7 @@ class Sight:
         """Whether the vehicle is in unseen space."""
         if view.free.all_seen_around(position.x, position.y, view.now_s):  # the usual case
             return False
-        x, y = np.array((position.x,)), np.array((position.y,))
-        return bool(view.free.unseen(x, y, view.near_m, view.now_s, wide=False)[0])
+        return bool(view.unseen(np.array(((position.x,), (position.y,))), wide=False)[0])
 
     def hidden(self, tube: Tubes, view: View, brake: Hidden | None = None) -> Hidden:
         """The unseen cells on each tube, of both models. Without `brake` the last tube is braking's own.
@@ -83,14 +91,20 @@ class Sight:
         Where braking touches nothing unseen nothing else may, and only `soon` is counted.
         """
         leg = tube.stop_m - tube.turn_m
-        x, y = (tube.turn_m[..., axis, None] + leg[..., axis, None] * self._shares for axis in (0, 1))
-        free, near, now_s = view.free, view.near_m, view.now_s
-        soon = free.unseen(x, y, near, now_s + self._ahead_s, wide=True).max(axis=(0, 2))
+        if view.all_seen(tube.turn_m, tube.stop_m, self._ahead_s):  # the usual case
+            return _seen(np.zeros(leg.shape[1], dtype=np.intp))
+        along = leg.transpose(2, 0, 1)[:2, :, :, None] * self._shares
+        places = tube.turn_m.transpose(2, 0, 1)[:2, :, :, None] + along
+        soon = view.unseen(places, True, self._ahead_s).max(axis=(0, 2))
         if (soon if brake is None else brake.soon)[-1] == 0:
-            return Hidden(soon, soon, soon, soon, np.zeros(soon.shape), NOWHERE)
-        braking = np.array((x[:, -1].reshape(-1), y[:, -1].reshape(-1))) if brake is None else brake.brake_m
-        wide, exact = (free.unseen(x, y, near, now_s, wide=far).max(axis=(0, 2)) for far in (True, False))
-        more = free.unseen(x, y, near, now_s + self._ahead_s, False, braking).max(axis=(0, 2))
-        stop_x, stop_y = tube.stop_m[..., 0].reshape(-1), tube.stop_m[..., 1].reshape(-1)
-        gaps = free.gap_m(stop_x, stop_y, near, now_s).reshape(2, -1).min(axis=0)
+            return _seen(soon)
+        braking = places[:, :, -1].reshape(2, -1) if brake is None else brake.brake_m
+        wide, exact = (view.unseen(places, far).max(axis=(0, 2)) for far in (True, False))
+        more = view.unseen(places, False, self._ahead_s, braking).max(axis=(0, 2))
+        gaps = view.free.gap_m(tube.stop_m.reshape(-1, 3).T[:2], view.near_m, view.now_s).reshape(2, -1).min(axis=0)
         return Hidden(soon, wide, exact, more, gaps, braking)
+
+
+def _seen(soon: Integers) -> Hidden:
+    """Where braking touches nothing unseen, one count is enough."""
+    return Hidden(soon, soon, soon, soon, np.zeros(soon.shape), NOWHERE)

@@ -26,7 +26,7 @@ def looked(free=None, pose=None, ranges=None, time_s=0.0, c=C, **kinds):
 
 
 def seen_at(free, x, y, now_s=0.0, near=NOTHING, wide=False):
-    return int(free.unseen(np.array([x]), np.array([y]), near, now_s, wide)[0]) == 0
+    return int(free.unseen(np.array([[x], [y]]), near, now_s, wide)[0]) == 0
 
 
 def seen_cells(free) -> np.ndarray:
@@ -145,7 +145,7 @@ def test_jump_of_the_estimate_leaves_an_empty_map(x, y):
 def test_off_the_map_is_unseen(x, y):
     free = looked()
     assert not seen_at(free, x, y)
-    assert free.gap_m(np.array([x]), np.array([y]), NOTHING, 0.0)[0] == 0.0
+    assert free.gap_m(np.array([[x], [y]]), NOTHING, 0.0)[0] == 0.0
 
 
 boxes = st.lists(st.tuples(*[st.floats(-2.5, 2.5)] * 2, *[st.floats(0.1, 1.0)] * 2), min_size=0, max_size=4)
@@ -189,9 +189,9 @@ def test_counting_agrees_with_looking_at_every_cell(dx, dy, wide):
 
 def test_gap_is_the_distance_to_the_nearest_unseen_cell():
     free = looked(ranges=np.zeros(180))
-    places = np.array((5.05, 5.15, 5.45)), np.full(3, 0.05)
+    places = np.array(((5.05, 5.15, 5.45), (0.05, 0.05, 0.05)))
     cells = (np.stack(np.nonzero(~np.isfinite(free._seen_s)), axis=1) + free._corner + 0.5) * CELL_M
-    for x, y, gap in zip(*places, free.gap_m(*places, NOTHING, 0.0), strict=True):
+    for x, y, gap in zip(*places, free.gap_m(places, NOTHING, 0.0), strict=True):
         across = np.maximum(np.abs(cells - (x, y)) - 0.5 * CELL_M, 0.0)
         assert gap == pytest.approx(min(float(np.hypot(*across.T).min()), 0.6), abs=1e-6)
 
