@@ -35,7 +35,7 @@ _REACH_ERROR_M = CELL_M * math.sqrt(2.0)  # of a cell's far corner, seen from an
 _WIDEST_RAD = math.radians(60.0)  # nearer cells fill more of the view: they are the vehicle's own
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Patch:
     """The unseen cells of a window of the map at one moment. Every tube of a tick asks here, so sums are made once.
 
