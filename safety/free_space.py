@@ -36,7 +36,7 @@ _WIDEST_RAD = math.radians(60.0)  # nearer cells fill more of the view: they are
 NOWHERE = np.empty((2, 0))
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Patch:
     """The unseen cells of a window of the map at one moment. Every tube of a tick asks here, so sums are made once.
 
