@@ -9,24 +9,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from safety.config import SafetyConfig
 from safety.lidar import SeenScan
+from safety.unseen_cells import CELL_M, Patch, Window, boxes_within, cells_of, surfaces, window_around
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 Booleans = NDArray[np.bool_]
-Window = tuple[int, int, int, int]  # of cells: the first ones, and those after the last
 
-CELL_M = 0.1
 SIDE_CELLS = 128
 CARVE_M = 2.5  # a scan is taken in up to this far: a brake tube and the hull need less
 RECENTRE_CELLS = 8  # the map follows the vehicle in steps of this size
-SURFACE_CELLS = 2  # cells this near to a known return belong to it
 TAKE_OFF_M = 0.9  # at engaging nothing may stand nearer to the vehicle's centre than this, unseen by the LiDAR
 VICINITY_CELLS = 2  # around the swept hull: what is known there stays known while the vehicle stands
 STEP_M = 0.2  # between the discs that stand for a swept hull
@@ -34,47 +31,6 @@ PATCH_CELLS = 10  # a patch is made so much wider than what is asked first: the 
 _REACH_ERROR_M = CELL_M * math.sqrt(2.0)  # of a cell's far corner, seen from anywhere in the cell of the LiDAR
 _WIDEST_RAD = math.radians(60.0)  # nearer cells fill more of the view: they are the vehicle's own
 NOWHERE = np.empty((2, 0))
-
-
-@dataclass(frozen=True, slots=True)
-class _Patch:
-    """The unseen cells of a window of the map at one moment. Every tube of a tick asks here, so sums are made once.
-
-    `low_x`, `low_y`: its first cell. `counts`: per kernel, what the hull would touch with its centre in each cell. `spared`: the
-    same without the cells that the hull touches at some places, and those places.
-    """
-
-    near_m: Floats
-    low_x: int
-    low_y: int
-    hidden: Booleans
-    counts: dict[bool, Integers] = field(default_factory=dict)
-    spared: tuple[Floats, _Patch] | None = None
-
-    def holds(self, low_x: int, low_y: int, high_x: int, high_y: int, near_m: Floats) -> bool:
-        """Whether it was made for the same returns and is large enough."""
-        rows, columns = self.hidden.shape
-        inside = low_x >= self.low_x and low_y >= self.low_y and high_x <= self.low_x + rows and high_y <= self.low_y + columns
-        return inside and near_m is self.near_m
-
-    def sparing(self, places_m: Floats, boxes: Integers) -> _Patch:
-        """The patch without the cells of the boxes around places [2, n]."""
-        if self.spared is None or self.spared[0] is not places_m:
-            hidden, cells = self.hidden.copy(), _cells(places_m)
-            _clear(hidden, boxes, cells[0] - self.low_x, cells[1] - self.low_y)
-            self.spared = (places_m, _Patch(self.near_m, self.low_x, self.low_y, hidden))
-        return self.spared[1]
-
-    def part(self, low_x: int, low_y: int, high_x: int, high_y: int) -> Booleans:
-        """The unseen cells of a smaller window."""
-        return self.hidden[low_x - self.low_x : high_x - self.low_x, low_y - self.low_y : high_y - self.low_y]
-
-    def counted(self, cells: Integers, boxes: Integers, rim: int, wide: bool) -> Integers:
-        """The weighted sums of a kernel's boxes at cells [2, ...]."""
-        if wide not in self.counts:
-            self.counts[wide] = _box_counts(self.hidden, boxes, rim)
-        found: Integers = self.counts[wide][cells[0] - (self.low_x + rim), cells[1] - (self.low_y + rim)]
-        return found
 
 
 class FreeSpace:
@@ -86,7 +42,7 @@ class FreeSpace:
         self._seen_s = np.empty((SIDE_CELLS, SIDE_CELLS), dtype=np.float32)  # since the first scan; -inf = never
         self._spare = np.empty_like(self._seen_s)
         hull = config.vehicle_radius_m + config.position_error_m + config.velocity_error_m_s * config.delay_s + _sagitta_m(config)
-        self._kernels = (_boxes(hull + CELL_M), _boxes(hull))
+        self._kernels = (boxes_within(hull + CELL_M), boxes_within(hull))
         self._rims = tuple(int(boxes.max()) for boxes in self._kernels)
         self._rim = self._rims[0]
         self._hull = _disc(config.vehicle_radius_m)
@@ -96,7 +52,7 @@ class FreeSpace:
     def clear(self) -> None:
         """Nothing was ever seen."""
         self._seen_s.fill(-np.inf)
-        self._patches: dict[float, _Patch] = {}
+        self._patches: dict[float, Patch] = {}
         self._corner = (0, 0)
         self._began_s: float | None = None
         self._shrunk_s = 0.0
@@ -160,8 +116,8 @@ class FreeSpace:
         """
         kernel = 0 if wide else 1
         boxes, rim = self._kernels[kernel], self._rims[kernel]
-        cells = _cells(places_m)
-        window = _window(cells, rim)
+        cells = cells_of(places_m)
+        window = window_around(cells, rim)
         patch = self._patch_of(window, near_m, now_s)
         if patch is None:
             return np.full(places_m.shape[1:], SIDE_CELLS * SIDE_CELLS, dtype=np.intp)
@@ -186,7 +142,7 @@ class FreeSpace:
     def gap_m(self, places_m: Floats, near_m: Floats, now_s: float) -> Floats:
         """Distance from places [2, n] to the nearest unseen cell, m; what is further than the hull needs reads as that."""
         rim = self._rim
-        window = _window(_cells(places_m), rim)
+        window = window_around(cells_of(places_m), rim)
         patch = self._patch_of(window, near_m, now_s)
         if patch is None:
             return np.zeros(places_m.shape[1])
@@ -199,7 +155,7 @@ class FreeSpace:
     def _corner_cells(self, place_m: Sequence[float]) -> tuple[int, int]:
         return _cell(place_m[0]) - self._corner[0], _cell(place_m[1]) - self._corner[1]
 
-    def _patch_of(self, window: Window, near_m: Floats, now_s: float) -> _Patch | None:
+    def _patch_of(self, window: Window, near_m: Floats, now_s: float) -> Patch | None:
         """A patch of the map that holds a window (one of this tick when it does); None for a window that is not on the map."""
         (left, below), (low_x, low_y, high_x, high_y) = self._corner, window
         right, above = left + SIDE_CELLS, below + SIDE_CELLS
@@ -211,7 +167,7 @@ class FreeSpace:
             high_x, high_y = min(high_x + PATCH_CELLS, right), min(high_y + PATCH_CELLS, above)
             oldest_s = now_s - self._began_s - self._config.memory_s
             hidden = self._hidden(low_x - left, low_y - below, high_x - left, high_y - below, near_m, oldest_s)
-            patch = _Patch(near_m, low_x, low_y, hidden)
+            patch = Patch(near_m, low_x, low_y, hidden)
             self._patches = {moment: old for moment, old in self._patches.items() if old.near_m is near_m} | {now_s: patch}
         return patch
 
@@ -219,7 +175,7 @@ class FreeSpace:
         """The unseen cells of a window of the map that belong to no known return."""
         hidden: Booleans = self._seen_s[low_x:high_x, low_y:high_y] < oldest_s
         if near_m.shape[1] and hidden.any():
-            hidden &= ~_surfaces(near_m, low_x + self._corner[0], low_y + self._corner[1], hidden.shape)
+            hidden &= ~surfaces(near_m, low_x + self._corner[0], low_y + self._corner[1], hidden.shape)
         return hidden
 
 
@@ -290,37 +246,6 @@ def _reaches(seen: SeenScan, config: SafetyConfig) -> Floats:
     return reach
 
 
-def _surfaces(near_m: Floats, low_x: int, low_y: int, shape: tuple[int, ...]) -> Booleans:
-    """Cells of a window, whose first cell is given, that belong to known returns."""
-    border = SURFACE_CELLS + 1  # what is further out than the border lands in its outermost cells, and those are left off
-    mask = np.zeros((shape[0] + 2 * border, shape[1] + 2 * border), dtype=np.bool_)
-    cells = _cells(near_m)
-    ix = np.minimum(np.maximum(cells[0] - (low_x - border), 0), mask.shape[0] - 1)
-    iy = np.minimum(np.maximum(cells[1] - (low_y - border), 0), mask.shape[1] - 1)
-    mask[ix, iy] = True
-    return _widened(_widened(mask[1:-1, 1:-1]).T).T
-
-
-def _widened(mask: Booleans) -> Booleans:
-    """Rows, less a border of `SURFACE_CELLS` on either side, in which a cell is set when one within the border's width was."""
-    twice = mask[:-1] | mask[1:]
-    four = twice[:-2] | twice[2:]
-    return four[:-1] | mask[4:]
-
-
-def _cells(places_m: Floats) -> Integers:
-    """The cells [2, ...] in which places [2, ...] lie."""
-    cells: Integers = np.floor(places_m / CELL_M).astype(np.intp)
-    return cells
-
-
-def _window(cells: Integers, rim: int) -> Window:
-    """All that the hull could touch with its centre in cells [2, ...]."""
-    flat = cells.reshape(2, -1)
-    (low_x, low_y), (high_x, high_y) = flat.min(axis=1).tolist(), flat.max(axis=1).tolist()
-    return low_x - rim, low_y - rim, high_x + rim + 1, high_y + rim + 1
-
-
 def _cell(metres: float) -> int:
     return math.floor(metres / CELL_M)
 
@@ -345,32 +270,3 @@ def _disc(radius_m: float) -> Integers:
     within = CELL_M * np.hypot(i, j) <= radius_m
     offsets: Integers = (i * SIDE_CELLS + j)[within]
     return offsets
-
-
-def _boxes(radius_m: float) -> Integers:
-    """Half sides [b, 2], in cells, of boxes that together are all cells within a radius of any point of the middle cell."""
-    reach = radius_m / CELL_M
-    widths = [(i, 1 + math.floor(math.sqrt(reach * reach - max(i - 1, 0) ** 2))) for i in range(math.floor(reach) + 2)]
-    corners = [box for box, after in zip(widths, [*widths[1:], (0, -1)], strict=True) if after[1] < box[1]]
-    return np.array(corners)
-
-
-def _clear(hidden: Booleans, boxes: Integers, i: Integers, j: Integers) -> None:
-    """Take the cells of the boxes around middle cells i, j [n], which may lie outside the window, out of the hidden ones."""
-    for row, column in set(zip(i.tolist(), j.tolist(), strict=True)):
-        for a, b in boxes.tolist():
-            hidden[max(row - a, 0) : max(row + a + 1, 0), max(column - b, 0) : max(column + b + 1, 0)] = False
-
-
-def _box_counts(hidden: Booleans, boxes: Integers, rim: int) -> Integers:
-    """Sum over the boxes of the hidden cells inside, for each middle cell at least `rim` from the border."""
-    total = np.zeros((hidden.shape[0] + 1, hidden.shape[1] + 1), dtype=np.intp)
-    hidden.cumsum(axis=0, dtype=np.intp).cumsum(axis=1, out=total[1:, 1:])
-    rows, columns = hidden.shape[0] - 2 * rim, hidden.shape[1] - 2 * rim
-    counts = np.zeros((rows, columns), dtype=np.intp)
-    for a, b in boxes.tolist():
-        top, bottom = slice(rim - a, rim - a + rows), slice(rim + a + 1, rim + a + 1 + rows)
-        left, right = slice(rim - b, rim - b + columns), slice(rim + b + 1, rim + b + 1 + columns)
-        counts += total[bottom, right] - total[top, right]
-        counts += total[top, left] - total[bottom, left]
-    return counts

@@ -53,6 +53,13 @@ def fence_hold_off(depth):
     return hold_off(depth) if depth <= FENCE_BAND else 0.0
 
 
+def test_too_near_one_piece_of_the_fence_the_others_keep_their_room():
+    rest = Tubes(np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+    fence = np.array((-0.15, 0.3, -0.02, 0.0, 0.5, 0.5))
+    found = allowance(rest, np.empty(0), fence, np.empty((2, 0)), np.zeros(2), None, C)
+    assert found.fence_m.tolist() == [-0.15, 0.0, -0.02, 0.0, 0.0, 0.0]
+
+
 @pytest.mark.parametrize("seed", range(120))
 def test_directions_and_speeds_due_are_those_of_the_slow_way(seed):
     position, tube, points, clear, fence, _ = scene(seed)

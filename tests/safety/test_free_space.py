@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safety_plant import cast, config, scan, state
 
-from safety.free_space import CARVE_M, CELL_M, SIDE_CELLS, SURFACE_CELLS, TAKE_OFF_M, FreeSpace
+from safety.free_space import CARVE_M, CELL_M, SIDE_CELLS, TAKE_OFF_M, FreeSpace
 from safety.lidar import BeamTable, see
+from safety.unseen_cells import SURFACE_CELLS
 
 C = config()
 NOTHING = np.empty((2, 0))

@@ -67,9 +67,9 @@ def test_what_passes_brings_the_hull_nowhere_where_braking_does_not(vx, vy, ux, 
 
 
 def test_spared_cells_do_not_count_and_may_lie_outside_the_window():
-    free, x, y = engaged_without_sight(), np.array([0.65]), np.array([0.05])
-    all_of_them = free.unseen(x, y, NONE, 0.0, wide=False)[0]
-    spared = [free.unseen(x, y, NONE, 0.0, False, np.array([(place,), (0.05,)]))[0] for place in (0.65, 0.95, 5.0, -5.0)]
+    free, here = engaged_without_sight(), np.array([(0.65,), (0.05,)])
+    all_of_them = free.unseen(here, NONE, 0.0, wide=False)[0]
+    spared = [free.unseen(here, NONE, 0.0, False, np.array([(place,), (0.05,)]))[0] for place in (0.65, 0.95, 5.0, -5.0)]
     assert spared[0] == 0
     assert 0 < spared[1] < all_of_them
     assert spared[2:] == [all_of_them, all_of_them]
