@@ -28,6 +28,7 @@ SCALES = (0.8, 0.6, 0.4, 0.2, 0.1, 0.05)
 TURNS_RAD = tuple(math.radians(angle) for angle in (15.0, 30.0, 45.0, 60.0, 75.0, 85.0))
 PUSHES = (1.0, 1.5)  # candidates are shifted by these multiples of what leads out of a margin
 FIRST_LOOK = 8  # candidates nearest to the wanted command, judged before all others: one of them usually passes
+WAY_SHARES = np.array([[1.0], [0.75], [0.5], [0.25], [0.0]])  # of the way out, for the limits: zero keeps to all of them
 OUTWARD = (0.0, 0.1)  # slid candidates: this share of the wanted speed away from the obstacle
 
 
@@ -97,6 +98,9 @@ class Shield:
             return Decision(_vector(first[0]), tuple(found), clearance, fence_margin)
         candidates = _capped(self._held_in(first[0], around, near, bounds), limit)
         chosen = self._nearest(first[0], candidates[within_limits(candidates)], around, near, bounds)
+        if chosen is None:
+            due = WAY_SHARES * self._due(around, near, bounds.allowed)
+            chosen = due[within_limits(due).argmax()]
         return Decision(_vector(chosen), tuple(found), clearance, fence_margin)
 
     def _speed_limit(self, around: Surroundings, clearance_m: float, fence_margin_m: float) -> float:
@@ -163,8 +167,10 @@ class Shield:
         np.clip(candidates[:, 2], allowed.sink_m_s, allowed.climb_m_s, out=candidates[:, 2])
         return candidates
 
-    def _nearest(self, wanted: Floats, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds) -> Floats:
-        """Of the candidates [c, 3] that pass, the one nearest to the wanted vector [3]; when none does, only what is due."""
+    def _nearest(
+        self, wanted: Floats, candidates: Floats, around: Surroundings, near: NearFence, bounds: Bounds
+    ) -> Floats | None:
+        """Of the candidates [c, 3] that pass, the one nearest to the wanted vector [3]."""
         away = candidates - wanted
         candidates = candidates[np.argsort(np.einsum("ci,ci->c", away, away), kind="stable")]
         for few in (candidates[:FIRST_LOOK], candidates[FIRST_LOOK:]):
@@ -172,7 +178,7 @@ class Shield:
             if passed.shape[0]:
                 nearest: Floats = few[passed[0]]
                 return nearest
-        return self._due(around, near, bounds.allowed)
+        return None
 
     def _due(self, around: Surroundings, near: NearFence, allowed: Allowance) -> Floats:
         """The way out of a margin [3], even into the unseen, since what presses is known; else no horizontal command."""

@@ -82,7 +82,7 @@ class Judge:
         outcome.clearance_m, outcome.fence_m = min(outcome.clearance_m, clearance_m), min(outcome.fence_m, fence_m)
         touching, outside = clearance_m < 0.0, fence_m < 0.0
         if touching and not self._touching:
-            moving = float(np.linalg.norm(velocity)) > MOVING_M_S
+            moving = math.hypot(velocity[0], velocity[1]) > MOVING_M_S
             outcome.note("contact" if moving else "contact at rest", now_s)
         if outside and not self._outside:
             outcome.note("fence", now_s)

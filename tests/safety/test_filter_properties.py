@@ -18,6 +18,7 @@ from safety.frames import CorridorVector
 from safety.messages import LidarScan, SafeCommand, VehicleState, VelocityCommand
 
 quick = settings(max_examples=60, deadline=None)
+ROUNDED_M_S = 5e-3  # ranges are 32 bit numbers; the way out between contradictions magnifies their rounding
 speed = st.floats(-1.2, 1.2)
 wild = st.one_of(st.floats(), st.floats(-2.0, 2.0), st.sampled_from([math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324]))
 angle = st.floats(-math.pi, math.pi)
@@ -229,7 +230,7 @@ def test_turned_world_gives_the_turned_command(boxes, quarters, ux, uy, v):
     there, _ = once(
         wanted, state(x=XC, y=YC, v=(c * v, s * v, 0), yaw=yaw), view(turned, XC, YC, yaw=yaw, centre=(XC, YC)), fence=wide
     )
-    assert away(wanted, there) == pytest.approx(away(command(ux, uy), here), abs=1e-3)
+    assert away(wanted, there) == pytest.approx(away(command(ux, uy), here), abs=ROUNDED_M_S)
 
 
 @given(boxes_around, speed, speed, st.integers(-80, 80), st.integers(-20, 20))
@@ -241,7 +242,7 @@ def test_shifted_world_gives_the_same_command(boxes, ux, uy, cells_x, cells_y):
     here, _ = once(command(ux, uy), state(x=XC, y=YC), view(boxes, XC, YC, centre=(XC, YC)), fence=wide)
     x, y = XC + 0.1 * cells_x, YC + 0.1 * cells_y
     there, _ = once(command(ux, uy), state(x=x, y=y), view(boxes, x, y, centre=(x, y)), fence=wide)
-    assert away(command(ux, uy), there) == pytest.approx(away(command(ux, uy), here), abs=1e-3)
+    assert away(command(ux, uy), there) == pytest.approx(away(command(ux, uy), here), abs=ROUNDED_M_S)
 
 
 @given(boxes_around, speed, speed, st.integers(-3, 3))

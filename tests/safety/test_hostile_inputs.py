@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from safety_plant import command, config, scan, state
 
@@ -17,6 +17,7 @@ from safety.lidar import TILT_BAND_M, BeamTable, see
 
 AT_REST = CorridorVector(0.0, 0.0, 0.0)
 SIDES = np.full(180, 2.0) + 0.001 * np.arange(180)
+quick = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 NOT_FINITE = st.sampled_from((math.nan, math.inf, -math.inf))
 
 
@@ -37,6 +38,7 @@ def brakes(safety: SafetyFilter, rule: str, now_s: float, **parts) -> bool:
     return sent.velocity == AT_REST and sent.yaw_rate_rad_s == 0.0 and verdict.braking and verdict.fault == rule
 
 
+@quick
 @given(
     st.sampled_from(("velocity", "acceleration", "position", "roll_rad", "pitch_rad", "yaw_rad", "yaw_rate_rad_s")),
     st.sampled_from("xyz"),
@@ -50,6 +52,7 @@ def test_one_number_of_the_estimate_that_is_none_brakes(part, axis, value):
     assert brakes(safety, "state_not_finite", now, state=dataclasses.replace(good, **{part: bad}))
 
 
+@quick
 @given(st.sampled_from(("state", "scan")))
 def test_a_stamp_that_is_no_number_is_not_young(which):
     safety, now = in_flight()
@@ -57,12 +60,14 @@ def test_a_stamp_that_is_no_number_is_not_young(which):
     assert brakes(safety, {"state": "state_stale", "scan": "scan_not_finite"}[which], now, **{which: bad})
 
 
+@quick
 @given(st.floats(1e-6, 1e4))
 def test_a_clock_that_went_back_by_any_amount_brakes(back_s):
     safety, now = in_flight()
     assert brakes(safety, "clock_backwards", now - 0.05 - back_s)
 
 
+@quick
 @given(st.integers(91, 180), st.sampled_from((0.0, -1.0, -math.inf, 0.05)), st.randoms(use_true_random=False))
 def test_a_covered_lens_brakes_however_it_shows(covered, value, chance):
     safety, now = in_flight(SIDES)
@@ -71,6 +76,7 @@ def test_a_covered_lens_brakes_however_it_shows(covered, value, chance):
     assert brakes(safety, "scan_touching", now, scan=scan(ranges, now))
 
 
+@quick
 @given(st.floats(0.8, 2.9), st.integers(40, 180))
 def test_walls_do_not_vanish_between_two_scans(distance, beams):
     walls = np.where(np.arange(180) < beams, distance + 0.001 * np.arange(180), np.inf)
@@ -79,6 +85,7 @@ def test_walls_do_not_vanish_between_two_scans(distance, beams):
     assert brakes(safety, "scan_blank", now, scan=scan(np.full(180, np.inf), now))
 
 
+@quick
 @given(
     st.sampled_from(("angle_increment_rad", "range_max_m", "range_min_m")),
     st.sampled_from((0.0, -0.1, -4.0)),
@@ -89,6 +96,7 @@ def test_a_scan_of_impossible_geometry_brakes(part, value):
     assert brakes(safety, "scan_geometry", now, scan=dataclasses.replace(scan(time_s=now), **{part: bad}))
 
 
+@quick
 @given(st.floats(-math.pi, math.pi), st.floats(155.0, 308.2))
 @example(math.pi / 4.0, 308.2)
 def test_huge_commands_are_shortened_and_keep_their_direction(bearing, exponent):
@@ -102,6 +110,7 @@ def test_huge_commands_are_shortened_and_keep_their_direction(bearing, exponent)
     assert math.remainder(math.atan2(sent.velocity.y, sent.velocity.x) - bearing, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-6)
 
 
+@quick
 @given(st.floats(-0.4, 0.4), st.floats(1.3, 50.0))
 def test_a_command_over_the_limit_keeps_its_direction(bearing, speed):
     safety, limit = SafetyFilter(config()), config().max_horizontal_speed_m_s
@@ -113,6 +122,7 @@ def test_a_command_over_the_limit_keeps_its_direction(bearing, speed):
         assert math.atan2(sent.velocity.y, sent.velocity.x) == pytest.approx(bearing, abs=1e-9)
 
 
+@quick
 @given(st.floats(0.6, 3.0))
 def test_no_faster_than_the_sensor_sees(sight):
     """With so short a view the speed limit is what stops within it, told as such."""
@@ -126,6 +136,7 @@ def test_no_faster_than_the_sensor_sees(sight):
         assert "speed_limit" in {why.rule for why in verdict.interventions}
 
 
+@quick
 @given(st.floats(0.5, 0.9), st.floats(0.25, 0.35), st.floats(-0.1, 0.1))
 def test_a_beam_that_meets_the_ground_says_nothing_of_what_is_behind(height, pitch, roll):
     """Nose down, so that the beams ahead end on the ground: no obstacle, and free only as far as at the vehicle's height."""

@@ -20,14 +20,14 @@ X, Y = 15.05, 0.05
 KEPT_M = C.keep_out_m + C.velocity_error_m_s * (C.dead_time_s + C.tick_s)  # at rest, of a point seen just now
 
 
-def sent_at_rest(*points: tuple[float, float]) -> CorridorVector:
+def sent_at_rest(*points: tuple[float, float], within=lambda few: np.ones(len(few), dtype=bool)) -> CorridorVector:
     """What is sent for a command of zero by a vehicle at rest, all seen around it; points by distance and bearing."""
     free = FreeSpace(C)
     free.update(see(scan(beams=360, fov=2.0 * math.pi), state(x=X, y=Y), BeamTable(), C))
     at = np.array([(X + d * math.cos(bearing), Y + d * math.sin(bearing)) for d, bearing in points]).T
     start = Start(np.array([(X, Y, 2.0)] * 2), np.zeros((2, 3)))
     around = Surroundings(at[0], at[1], np.zeros(len(points)), View(free, at, 0.0), CorridorVector(X, Y, 2.0), start)
-    return Shield(C).choose(ZERO, around, lambda few: np.ones(len(few), dtype=bool)).velocity
+    return Shield(C).choose(ZERO, around, within).velocity
 
 
 @pytest.mark.parametrize("bearing", [-1.7, -1.9, 1.7, 2.1])
@@ -46,3 +46,13 @@ def test_but_the_way_out_never_leads_into_the_errors_or_nearer_than_the_worst(ah
 def test_what_is_permitted_on_the_way_out_stays_within_the_margin():
     sent = sent_at_rest((C.vehicle_radius_m, 0.0), (KEPT_M - 0.03, math.pi))
     assert sent.x > -0.05
+
+
+def test_the_way_out_keeps_to_the_limits():
+    """Only as much of it as may be sent after the last command; nothing when not even that."""
+    full = sent_at_rest((C.vehicle_radius_m, 0.0))
+    for longest in (0.2, 0.1, 0.0):
+        sent = sent_at_rest((C.vehicle_radius_m, 0.0), within=lambda few, most=longest: np.hypot(few[:, 0], few[:, 1]) <= most)
+        assert full.x * (1.0 if longest else 0.0) <= sent.x <= 0.0
+        assert -longest <= sent.x
+        assert longest == 0.0 or sent.x < -0.25 * longest
