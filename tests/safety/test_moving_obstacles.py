@@ -15,9 +15,13 @@ from hypothesis import strategies as st
 from safety_plant import Plant, cast, command, config, gap_m
 from safety_vehicle import FENCE, scan_of, state_of
 
-from safety.braking import STANDSTILL_M_S, slow_after_s
+from safety.braking import STANDSTILL_M_S, Start, Tubes, slow_after_s
 from safety.config import SafetyConfig
 from safety.filter import SafetyFilter
+from safety.frames import CorridorVector
+from safety.free_space import FreeSpace
+from safety.shield import Shield, Surroundings
+from safety.sight import View
 from sim_gateway.estimate import EstimateNoise
 from sim_gateway.scene import Mover, World
 from sim_gateway.simulation import Simulation, step_at
@@ -121,6 +125,18 @@ def test_the_vehicle_never_runs_into_crossing_movers(speed, seed):
                 worst = max(worst, float(np.array(sim.truth.velocity_m_s[:2]) @ towards_box(flat, x, y)))
     assert worst <= SLOW_M_S
     assert sim.truth.position_m[0] > 6.0
+
+
+@given(st.floats(0.01, 1.0), st.floats(0.5, 3.0))
+def test_a_standing_vehicle_counts_what_a_mover_covers_before_it_can_act(speed, away):
+    """A command takes dead time and a tick until it acts; nothing else is to come where nothing moves."""
+    c = config(obstacle_speed_m_s=speed)
+    place = np.array([[[5.0, 0.0, 2.0]], [[5.0, 0.0, 2.0]]])
+    view = View(FreeSpace(c), np.array([[5.0 + away], [0.0]]), 0.0)
+    around = Surroundings(*view.near_m, np.zeros(1), view, CorridorVector(5.0, 0.0, 2.0), Start(place[:, 0], np.zeros((2, 3))))
+    clear = Shield(c)._tube_clearances(Tubes(place, place), around)
+    blind_m = (c.velocity_error_m_s + speed) * (c.dead_time_s + c.tick_s)
+    assert clear == pytest.approx(away - c.keep_out_m - blind_m)
 
 
 @given(st.floats(0.11, 1.2), st.floats(0.2, 1.0))
