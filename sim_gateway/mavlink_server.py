@@ -13,7 +13,9 @@ from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.autopilot import Autopilot
 from sim_gateway.commands import Command, CommandHandler
+from sim_gateway.attitude_setpoints import read_attitude_target
 from sim_gateway.fence import FENCE, MISSION, ItemStore, legs, shapes
+from sim_gateway.file_server import FileServer
 from sim_gateway.flight_modes import CRITICAL, FlightMode, Result
 from sim_gateway.local_frame import LocalFrame
 from sim_gateway.log_server import LogServer
@@ -59,6 +61,7 @@ class MavlinkServer:
         self._stores = {FENCE: self.fence, MISSION: self.mission}
         self.vehicle_log = VehicleLog(autopilot)
         self._log_server = LogServer(self.vehicle_log)
+        self._file_server = FileServer(self.vehicle_log)
         self.wire_log = WireLog(self._now)
         self._handlers: dict[str, Callable[[Message, MavlinkLink], None]] = {
             "HEARTBEAT": self._on_heartbeat,
@@ -67,6 +70,7 @@ class MavlinkServer:
             "SET_MODE": self._on_set_mode,
             "SET_POSITION_TARGET_LOCAL_NED": self._on_local_setpoint,
             "SET_POSITION_TARGET_GLOBAL_INT": self._on_global_setpoint,
+            "SET_ATTITUDE_TARGET": self._on_attitude_target,
             "PARAM_REQUEST_LIST": self._on_param_list,
             "PARAM_REQUEST_READ": self._on_param_read,
             "PARAM_SET": self._on_param_set,
@@ -81,6 +85,7 @@ class MavlinkServer:
             "LOG_REQUEST_DATA": lambda m, link: self._log_server.on_data(m, link.send),
             "LOG_REQUEST_END": lambda m, link: self._log_server.on_end(m, link.send),
             "LOG_ERASE": lambda m, link: self._log_server.on_erase(m, link.send),
+            "FILE_TRANSFER_PROTOCOL": lambda m, link: self._file_server.on_request(m, link.send),
             "MANUAL_CONTROL": self._on_manual_control,
             "TIMESYNC": self._on_timesync,
             "PING": self._on_ping,
@@ -113,6 +118,7 @@ class MavlinkServer:
         self._send_changes()
         self.vehicle_log.watch()
         self._log_server.poll()
+        self._file_server.poll()
         for link in self.links:
             self.fence.poll(link.send)
             self.mission.poll(link.send)
@@ -227,6 +233,12 @@ class MavlinkServer:
             pilot.say(CRITICAL, str(error))
             return
         pilot.set_setpoint(setpoint)
+
+    def _on_attitude_target(self, m: Message, _: MavlinkLink) -> None:
+        rates = (m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate)
+        setpoint = read_attitude_target(m.type_mask, tuple(m.q), rates, m.thrust)
+        if setpoint is not None:
+            self._autopilot.set_setpoint(setpoint)
 
     # ---- parameters
 

@@ -69,7 +69,10 @@ class PilotedVehicle:
         self._snapshot = None
 
     def _fly(self, n_steps: int, output: ControlOutput) -> None:
-        if output.motors_on:
+        if output.thrust is not None:
+            up = self.frame.vector_to_world(output.thrust.direction)
+            self.simulation.advance_thrust(n_steps, up, output.thrust.share, -output.yaw_rate_rad_s)
+        elif output.motors_on:
             self.simulation.advance(n_steps, self.frame.vector_to_world(output.velocity), -output.yaw_rate_rad_s)
         else:
             self.simulation.advance_motors_off(n_steps)
