@@ -170,5 +170,8 @@ def _name(number: int) -> str:
 
 
 def _frame(request: Request, opcode: int, sequence: int, offset: int, data: bytes, *, complete: bool = False) -> bytes:
-    header = (sequence & 0xFFFF, SESSION, opcode, len(data), request.opcode, int(complete), 0, offset)
+    session = (
+        SESSION if opcode == ACK else request.session
+    )  # PX4 answers in place: only opening a file gives its session's number
+    header = (sequence & 0xFFFF, session, opcode, len(data), request.opcode, int(complete), 0, offset)
     return _HEADER.pack(*header) + data

@@ -11,10 +11,10 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import development as mav
 
+from sim_gateway.attitude_setpoints import read_attitude_target
 from sim_gateway.autopilot import Autopilot
 from sim_gateway.commands import Command, CommandHandler
-from sim_gateway.attitude_setpoints import read_attitude_target
-from sim_gateway.fence import FENCE, MISSION, ItemStore, legs, shapes
+from sim_gateway.fence import MISSION, RALLY, ItemStore, legs, shapes
 from sim_gateway.file_server import FileServer
 from sim_gateway.flight_modes import CRITICAL, FlightMode, Result
 from sim_gateway.local_frame import LocalFrame
@@ -58,7 +58,8 @@ class MavlinkServer:
         self._shown_landed = -1
         self.fence = ItemStore(self._now, lambda items: autopilot.failsafes.geofence.set_shapes(shapes(items, frame)))
         self.mission = ItemStore(self._now, lambda items: autopilot.mission.replace(legs(items, frame)), MISSION)
-        self._stores = {FENCE: self.fence, MISSION: self.mission}
+        rally = ItemStore(self._now, mission_type=RALLY)
+        self._stores = {store.mission_type: store for store in (self.fence, self.mission, rally)}
         self.vehicle_log = VehicleLog(autopilot)
         self._log_server = LogServer(self.vehicle_log)
         self._file_server = FileServer(self.vehicle_log)
@@ -74,8 +75,8 @@ class MavlinkServer:
             "PARAM_REQUEST_LIST": self._on_param_list,
             "PARAM_REQUEST_READ": self._on_param_read,
             "PARAM_SET": self._on_param_set,
-            "MISSION_REQUEST_LIST": self._on_mission_list,
-            "MISSION_COUNT": self._on_mission_count,
+            "MISSION_REQUEST_LIST": self._for_store(ItemStore.on_list),
+            "MISSION_COUNT": self._for_store(ItemStore.on_count),
             "MISSION_CLEAR_ALL": self._on_mission_clear,
             "MISSION_SET_CURRENT": self._on_mission_set_current,
             "MISSION_ITEM_INT": self._for_store(ItemStore.on_item),
@@ -119,9 +120,9 @@ class MavlinkServer:
         self.vehicle_log.watch()
         self._log_server.poll()
         self._file_server.poll()
+        for store in self._stores.values():
+            store.poll()
         for link in self.links:
-            self.fence.poll(link.send)
-            self.mission.poll(link.send)
             for name in link.due(self._telemetry.available):
                 link.send(self._telemetry.build(name))
             for _ in range(min(_PARAMS_PER_POLL, len(link.parameter_queue))):
@@ -268,7 +269,7 @@ class MavlinkServer:
             for other in (link, *(x for x in self.links if x is not link)):
                 self._send_parameter(name, other)
 
-    # ---- fence and mission; rally points: a client that asks gets an empty list
+    # ---- fence, mission and rally points
 
     def _for_store(
         self, handler: Callable[[ItemStore, Message, Callable[[Message], None]], None]
@@ -279,26 +280,14 @@ class MavlinkServer:
 
         return handle
 
-    def _on_mission_list(self, m: Message, link: MavlinkLink) -> None:
-        if m.mission_type in self._stores:
-            self._stores[m.mission_type].on_list(m, link.send)
-            return
-        link.send(mav.MAVLink_mission_count_message(m.get_srcSystem(), m.get_srcComponent(), 0, m.mission_type))
-
-    def _on_mission_count(self, m: Message, link: MavlinkLink) -> None:
-        if m.mission_type in self._stores:
-            self._stores[m.mission_type].on_count(m, link.send)
-            return
-        result = mav.MAV_MISSION_ACCEPTED if m.count == 0 else mav.MAV_MISSION_UNSUPPORTED
-        link.send(mav.MAVLink_mission_ack_message(m.get_srcSystem(), m.get_srcComponent(), result, m.mission_type))
-
     def _on_mission_clear(self, m: Message, link: MavlinkLink) -> None:
-        for kind, store in self._stores.items():
-            if m.mission_type in (kind, mav.MAV_MISSION_TYPE_ALL):
-                store.on_clear(m, link.send)
-        if m.mission_type == mav.MAV_MISSION_TYPE_RALLY:
-            ack = mav.MAV_MISSION_ACCEPTED
-            link.send(mav.MAVLink_mission_ack_message(m.get_srcSystem(), m.get_srcComponent(), ack, m.mission_type))
+        if m.mission_type in self._stores:
+            self._stores[m.mission_type].on_clear(m, link.send)
+        elif m.mission_type == mav.MAV_MISSION_TYPE_ALL:
+            for store in self._stores.values():
+                store.clear()
+            sender = (m.get_srcSystem(), m.get_srcComponent())
+            link.send(mav.MAVLink_mission_ack_message(*sender, mav.MAV_MISSION_ACCEPTED, m.mission_type))
 
     def _on_mission_set_current(self, m: Message, _: MavlinkLink) -> None:
         if self._autopilot.mission.set_current(m.seq):

@@ -23,7 +23,7 @@ FLOWN = (*_STAYS, mav.MAV_CMD_NAV_TAKEOFF, mav.MAV_CMD_NAV_LAND, mav.MAV_CMD_NAV
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """One item: local north and east (not finite: where the vehicle is), altitude above home or in local up (`above_home`)."""
+    """One item: local north and east, altitude above home or in local up (`above_home`); not finite: where the vehicle is."""
 
     command: int
     north_m: float
@@ -35,6 +35,7 @@ class Leg:
     def target(self, here: Vector, home: Vector) -> Vector:
         """Where it ends, local NED."""
         down = home[2] - self.altitude_m if self.above_home else -self.altitude_m
+        down = down if math.isfinite(down) else here[2]
         north, east = (self.north_m, self.east_m) if math.isfinite(self.north_m) else here[:2]
         return (north, east, down)
 

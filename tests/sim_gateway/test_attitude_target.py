@@ -109,7 +109,8 @@ def test_what_cannot_be_flown_is_no_setpoint(mask: int, q: tuple[float, ...], ra
 
 def test_attitude_is_normalised_and_thrust_limited() -> None:
     given = read_attitude_target(RATES_IGNORED, (2.0, 0.0, 0.0, 2.0), (0.0,) * 3, 7.0)
-    assert given is not None and given.attitude is not None
+    assert given is not None
+    assert given.attitude is not None
     assert math.hypot(*given.attitude) == pytest.approx(1.0)
     assert yaw_of(given.attitude) == pytest.approx(math.pi / 2)
     assert given.thrust == 1.0
@@ -127,5 +128,6 @@ def test_armed_in_hold_stays_on_the_ground_for_all_its_noise() -> None:
     vehicle.advance(5)
     vehicle.autopilot.arm()
     vehicle.advance(2250)
-    assert vehicle.autopilot.armed and vehicle.autopilot.landed
+    assert vehicle.autopilot.armed
+    assert vehicle.autopilot.landed
     assert "Takeoff detected" not in [text.text for text in vehicle.autopilot.texts]

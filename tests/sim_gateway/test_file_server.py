@@ -20,6 +20,7 @@ HEADER = struct.Struct("<HBBBBBBI")
 @dataclass(frozen=True)
 class Answer:
     sequence: int
+    session: int
     opcode: int
     asked: int
     complete: int
@@ -44,8 +45,8 @@ class Files:
         answers = []
         for message in self.bench.onboard.named("FILE_TRANSFER_PROTOCOL"):
             raw = bytes(message.payload)
-            sequence, _, answer, length, asked, complete, _, place = HEADER.unpack_from(raw)
-            answers.append(Answer(sequence, answer, asked, complete, place, raw[12 : 12 + length]))
+            sequence, given, answer, length, asked, complete, _, place = HEADER.unpack_from(raw)
+            answers.append(Answer(sequence, given, answer, asked, complete, place, raw[12 : 12 + length]))
         return answers
 
     def one(self, opcode: int, data: bytes = b"", **more: int) -> Answer:
@@ -98,7 +99,12 @@ def test_a_log_read_in_pieces_and_by_burst_is_the_log(flown: Bench) -> None:
 
 def test_packed_parameters_are_not_there_and_nothing_can_be_changed(flown: Bench) -> None:
     files = Files(flown)
-    assert files.refusal(fs.OPEN_READ, b"@PARAM/param.pck") == fs.NOT_FOUND  # MAVProxy then asks the old way
+    refused = files.one(fs.OPEN_READ, b"@PARAM/param.pck", session=41)
+    assert (refused.opcode, refused.data, refused.session) == (
+        fs.NAK,
+        bytes([fs.NOT_FOUND]),
+        41,
+    )  # else it is not heeded
     assert files.refusal(8, b"/fs/microsd/log/log000.ulg") == fs.PROTECTED
     assert files.refusal(77) == fs.UNKNOWN_COMMAND
     assert files.refusal(fs.READ, size=240) == fs.INVALID_SIZE
