@@ -327,7 +327,9 @@ class Autopilot:
         self.target = command.target
         if task.landing and not was_landing and isinstance(task, ReturnTask):
             self.say(INFO, "RTL: land at destination")
-        if isinstance(task, TakeoffTask | MissionTask) and task.finished:
+        if isinstance(task, MissionTask) and task.returns:
+            self.return_to_launch()
+        elif isinstance(task, TakeoffTask | MissionTask) and task.finished:
             self._task_target = task.target
             self._task_yaw_rad = self.state.yaw_rad if isinstance(task, MissionTask) else task.state_at_entry.yaw_rad
             self._intend(FlightMode.LOITER)

@@ -111,6 +111,11 @@ def test_a_return_needs_no_place_and_no_height() -> None:
         bench.run(0.04).onboard.send(mav.MAVLink_mission_item_int_message(1, 1, number, *item, 0))
     assert bench.run(0.1).named("MISSION_ACK")[-1][1].type == mav.MAV_MISSION_ACCEPTED
     start(bench)
+    bench.run(30.0, until=lambda: bench.mode == "AUTO.RTL")
+    assert bench.mode == "AUTO.RTL"
+    bench.run(0.2)
+    assert [m.seq for _, m in bench.named("MISSION_ITEM_REACHED")] == [0, 1]  # by the last one MAVSDK knows that it is done
+    assert bench.telemetry.build("MISSION_CURRENT").mission_state == mav.MISSION_STATE_COMPLETE
     bench.run(60.0, until=lambda: not bench.pilot.armed)
     assert not bench.pilot.armed
     assert math.hypot(*bench.pilot.state.position[:2]) < 0.5
