@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,17 +44,22 @@ def test_two_vehicles_are_flown_at_once_and_apart(two_vehicles: Fleet) -> None:
     second = {"health": card.health, "parameters": card.parameters, "takeoff": card.takeoff, "fence": card.geofence}
     second |= {"land": card.land}
 
-    async def fly(port: int, verbs: dict[str, card.Verb]) -> tuple[list[dict[str, Any]], int]:
+    async def fly(port: int, verbs: dict[str, card.Verb]) -> tuple[list[dict[str, Any]], float]:
         async with connected(f"udpin://127.0.0.1:{port}") as drone:
-            return await card.perform(drone, verbs), await drone.param.get_param_int("GF_ACTION")  # type: ignore[attr-defined]
+            height = await drone.param.get_param_float("RTL_RETURN_ALT")  # type: ignore[attr-defined]
+            return await card.perform(drone, verbs), height
 
-    async def both() -> list[tuple[list[dict[str, Any]], int]]:
+    two_vehicles.gateways[1].vehicle.autopilot.parameters.set("RTL_RETURN_ALT", 21.0)
+
+    async def both() -> list[tuple[list[dict[str, Any]], float]]:
         return await asyncio.gather(fly(PORT, first), fly(PORT + 1, second))
 
-    (one, fence_one), (two, fence_two) = asyncio.run(both())
+    (one, height_one), (two, height_two) = asyncio.run(both())
     for step in (*one, *two):
         assert step["ok"], step
-    assert (fence_one, fence_two) == (0, 2)  # a parameter of one is not one of the other
+    assert (height_one, height_two) == (30.0, 21.0)
+    places = [gateway.vehicle.simulation.truth_position_m for gateway in two_vehicles.gateways]
+    assert math.dist(*places) > 5.0
 
 
 def test_clients_with_the_same_verbs_share_a_table() -> None:
