@@ -1,7 +1,7 @@
-"""Attitude setpoints of OFFBOARD (SET_ATTITUDE_TARGET): an attitude or body rates, with a thrust.
+"""What OFFBOARD flies past the velocity loop: attitude or body rates with a thrust (SET_ATTITUDE_TARGET), and accelerations.
 
-The recordings hold none: this follows PX4's documentation. Body rates are flown by integrating them into an attitude, so the
-vehicle lags them by the attitude loop instead of the rate loop.
+The recordings hold no attitude setpoints: those follow PX4's documentation. Body rates are flown by integrating them into an
+attitude, so the vehicle lags them by the attitude loop instead of the rate loop.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 from sim_gateway.local_frame import Vector
+from sim_gateway.vehicle_params import GRAVITY_M_S2
 
 # ATTITUDE_TARGET_TYPEMASK
 ROLL_RATE_IGNORE, PITCH_RATE_IGNORE, YAW_RATE_IGNORE, THRUST_IGNORE, ATTITUDE_IGNORE = 1, 2, 4, 64, 128
@@ -33,10 +34,22 @@ class AttitudeSetpoint:
 
 @dataclass(frozen=True, slots=True)
 class Thrust:
-    """A collective thrust, share of the motors', along a unit vector (NED; up is negative)."""
+    """A collective thrust along a unit vector (NED; up is negative): a share of the motors', or of what hovers (`of_hover`)."""
 
     direction: Vector
     share: float
+    of_hover: bool = False
+
+
+def thrust_for(acceleration: Vector, tilt_max_rad: float) -> Thrust:
+    """The thrust that gives an acceleration (NED, m/s2) to a vehicle without drag. The tilt limit cuts the horizontal part."""
+    north, east, down = acceleration
+    lift = max(GRAVITY_M_S2 - down, 0.1 * GRAVITY_M_S2)
+    wanted, most = math.hypot(north, east), GRAVITY_M_S2 * math.tan(tilt_max_rad)
+    kept = min(1.0, most / wanted) if wanted > 0.0 else 1.0
+    force = (kept * north, kept * east, -lift)
+    length = math.hypot(*force)
+    return Thrust((force[0] / length, force[1] / length, force[2] / length), length / GRAVITY_M_S2, of_hover=True)
 
 
 def read_attitude_target(type_mask: int, attitude: Quaternion, rates: Vector, thrust: float) -> AttitudeSetpoint | None:

@@ -40,7 +40,8 @@ READY_AFTER_S = 4.3  # recorded: arming is denied until about here
 _ARMING_DENIED = "Arming denied: Resolve system health failures first"
 _LANDING_DETECT_S = 1.8  # recorded 1.7 to 2.3 s from touch down to "Landing detected"
 _CLIMB_WANTED_M_S = 0.05
-_LIFT_OFF_S = 0.35  # recorded: takeoff is detected about that long after the motors have spooled up
+_LIFT_OFF_S = 0.35  # recorded: takeoff is detected about that long after the motors have spooled up,
+_LIFT_OFF_OFFBOARD_S = 0.65  # and that long in OFFBOARD by velocity
 _RAMP_START_M_S = 0.9  # the takeoff ramp starts as if descending, so that thrust comes up from its minimum
 _KEPT_TEXTS = 200
 _OVERRIDE_AUTO, _OVERRIDE_OFFBOARD = 1, 2  # bits of COM_RC_OVERRIDE
@@ -268,10 +269,10 @@ class Autopilot:
         self._task_yaw_rad = yaw_rad
         return Result.ACCEPTED
 
-    def enter_failsafe(self, mode: FlightMode) -> None:
-        """A failsafe takes the vehicle over; the intended mode stays."""
+    def enter_failsafe(self, mode: FlightMode, at: Vector | None = None) -> None:
+        """A failsafe takes the vehicle over; the intended mode stays. `at`: where to hold."""
         self.failsafe = True
-        self._task_target = self._task_yaw_rad = None
+        self._task_target, self._task_yaw_rad = at, None
         self._enter(mode)
 
     def leave_failsafe(self) -> None:
@@ -399,7 +400,8 @@ class Autopilot:
         get, now_s = self.parameters.get, self.now_s
         north, east, down = command.velocity
         wants_climb = down < -_CLIMB_WANTED_M_S
-        if self.landed and not (wants_climb and now_s - self._armed_at_s >= get("COM_SPOOLUP_TIME") + _LIFT_OFF_S):
+        lift_off_s = _LIFT_OFF_OFFBOARD_S if self.mode is FlightMode.OFFBOARD else _LIFT_OFF_S
+        if self.landed and not (wants_climb and now_s - self._armed_at_s >= get("COM_SPOOLUP_TIME") + lift_off_s):
             return ControlOutput(True)
         if self.landed:
             self._ramp_start_s = now_s

@@ -7,10 +7,10 @@ velocity references limited in acceleration. Gains and limits are read from PX4'
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
-from sim_gateway.attitude_setpoints import AttitudeLaw, AttitudeSetpoint, Thrust
+from sim_gateway.attitude_setpoints import AttitudeLaw, AttitudeSetpoint, Thrust, thrust_for
 from sim_gateway.local_frame import NedState, Vector, wrap_pi
 from sim_gateway.parameters import ParameterStore
 from sim_gateway.setpoints import NAN, NOTHING, OffboardSetpoint
@@ -289,7 +289,15 @@ class OffboardTask:
         if isinstance(self.setpoint, AttitudeSetpoint):
             return self._fly_attitude(self.setpoint, state, dt_s)
         self._attitude = AttitudeLaw()
+        if self.setpoint.only_acceleration:
+            return self._fly_acceleration(self.setpoint, state)
         return self._fly_motion(self.setpoint, state)
+
+    def _fly_acceleration(self, given: OffboardSetpoint, state: NedState) -> MotionCommand:
+        tilt = math.radians(self.parameters.get("MPC_TILTMAX_AIR"))
+        target = replace(given, yaw_rad=given.yaw_rad if math.isfinite(given.yaw_rad) else state.yaw_rad)
+        yaw_rate = self._yaw_rate(given.yaw_rad, given.yaw_rate_rad_s, state)
+        return MotionCommand((0.0, 0.0, given.acceleration[2]), yaw_rate, target, thrust_for(given.acceleration, tilt))
 
     def _fly_attitude(self, given: AttitudeSetpoint, state: NedState, dt_s: float) -> MotionCommand:
         thrust = self._attitude.update(given, state.yaw_rad, dt_s)
@@ -306,7 +314,7 @@ class OffboardTask:
         return MotionCommand(velocity, yaw_rate, OffboardSetpoint(held, velocity, NOTHING, yaw, rate))
 
     def _axis(self, given: OffboardSetpoint, i: int, state: NedState) -> float:
-        """Velocity wanted along one axis: position error plus feed-forward, velocity, or what makes the acceleration."""
+        """Velocity wanted along one axis: position error plus feed-forward, velocity, or (beside those) an acceleration."""
         get = self.parameters.get
         if math.isfinite(given.position[i]):
             gain = get("MPC_XY_P") if i < 2 else get("MPC_Z_P")

@@ -70,8 +70,10 @@ class PilotedVehicle:
 
     def _fly(self, n_steps: int, output: ControlOutput) -> None:
         if output.thrust is not None:
-            up = self.frame.vector_to_world(output.thrust.direction)
-            self.simulation.advance_thrust(n_steps, up, output.thrust.share, -output.yaw_rate_rad_s)
+            thrust = output.thrust
+            share = thrust.share * self.simulation.hover_thrust if thrust.of_hover else thrust.share
+            up = self.frame.vector_to_world(thrust.direction)
+            self.simulation.advance_thrust(n_steps, up, share, -output.yaw_rate_rad_s)
         elif output.motors_on:
             self.simulation.advance(n_steps, self.frame.vector_to_world(output.velocity), -output.yaw_rate_rad_s)
         else:

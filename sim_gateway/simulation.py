@@ -54,7 +54,7 @@ from sim_gateway.vehicle import (
     rotation,
     yaw_rad,
 )
-from sim_gateway.vehicle_params import VehicleParams
+from sim_gateway.vehicle_params import HOVER_THRUST, VehicleParams
 
 Array = NDArray[np.float64]
 
@@ -233,6 +233,11 @@ class Simulation:
         if setpoint.shape != (3,) or not all(map(math.isfinite, (*setpoint.tolist(), yaw_rate_sp))):
             raise ValueError(f"setpoint {velocity_sp}, {yaw_rate_sp}: give three finite velocities and a finite yaw rate")
         self._step(n_steps, setpoint, float(yaw_rate_sp), motors_on=True)
+
+    @property
+    def hover_thrust(self) -> float:
+        """The collective thrust, share of the motors', that the autopilot takes for hovering."""
+        return float(self._params[HOVER_THRUST])
 
     def advance_thrust(self, n_steps: int, direction: Sequence[float] | Array, thrust: float, yaw_rate_sp: float) -> None:
         """Fly `n_steps` of 4 ms past the velocity loop: collective `thrust` (0 to 1 of the motors') along a unit vector (world).

@@ -9,11 +9,11 @@ import pytest
 from mavlink_bench import EMPTY, Bench
 from pymavlink.dialects.v20 import development as mav
 
-from sim_gateway.attitude_setpoints import AttitudeLaw, AttitudeSetpoint, read_attitude_target, yaw_of
+from sim_gateway.attitude_setpoints import AttitudeLaw, AttitudeSetpoint, read_attitude_target, thrust_for, yaw_of
 from sim_gateway.flight_modes import FlightMode
 from sim_gateway.piloted import PilotedVehicle
 from sim_gateway.simulation import Simulation
-from sim_gateway.vehicle_params import IRIS
+from sim_gateway.vehicle_params import GRAVITY_M_S2, IRIS
 
 RATES_IGNORED, ATTITUDE_IGNORED = 0b111, 128
 HOVER = IRIS.hover_thrust
@@ -131,3 +131,25 @@ def test_armed_in_hold_stays_on_the_ground_for_all_its_noise() -> None:
     assert vehicle.autopilot.armed
     assert vehicle.autopilot.landed
     assert "Takeoff detected" not in [text.text for text in vehicle.autopilot.texts]
+
+
+def test_an_acceleration_is_flown_by_the_thrust_that_gives_it() -> None:
+    thrust = thrust_for((1.0, 0.0, 0.0), math.radians(45.0))
+    assert thrust.of_hover
+    assert thrust.share * thrust.direction[0] * GRAVITY_M_S2 == pytest.approx(1.0)
+    assert thrust.share * thrust.direction[2] == pytest.approx(-1.0)
+    steep = thrust_for((100.0, 0.0, 0.0), math.radians(45.0))
+    assert steep.direction == pytest.approx((math.sqrt(0.5), 0.0, -math.sqrt(0.5)))
+    assert thrust_for((0.0, 0.0, 50.0), math.radians(45.0)).direction == pytest.approx((0.0, 0.0, -1.0))  # never upside down
+
+
+def test_an_acceleration_alone_is_echoed_and_ends_where_drag_meets_it(bench: Bench) -> None:
+    _hover_offboard(bench)
+    for _ in range(75):
+        ahead = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.5, 0.0, 0.0, 0.0)
+        bench.onboard.send(mav.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, 0xC3F, *ahead))
+        bench.run(0.04)
+    now, echo = bench.vehicle.snapshot(), bench.onboard.named("POSITION_TARGET_LOCAL_NED")[-1]
+    assert now.velocity[1] == pytest.approx(3.0, abs=1.2)
+    assert abs(now.velocity[2]) < 0.3
+    assert (echo.type_mask, echo.afy) == (63, 1.5)
