@@ -201,7 +201,7 @@ def _mission_problem(message: Message) -> int | None:
 
 
 def _on_earth(message: Message) -> bool:
-    return abs(message.x) <= _SCALED_LIMITS[0] and abs(message.y) <= _SCALED_LIMITS[1]
+    return bool(abs(message.x) <= _SCALED_LIMITS[0] and abs(message.y) <= _SCALED_LIMITS[1])
 
 
 def _place_problem(message: Message, commands: Sequence[int]) -> int | None:

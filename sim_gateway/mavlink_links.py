@@ -61,7 +61,7 @@ class MavlinkLink(ABC):
         self._now_s = now_s
         self._defaults = {n: 1.0 / rates[column] for n, rates in STREAM_RATES_HZ.items() if rates[column] > 0}
         self.streams = dict(self._defaults)  # name: interval, s
-        self._queue = [(0.0, name) for name in self.streams]  # a heap: when each is due
+        self._queue = [(0.0, name, 0.0) for name in self.streams]  # a heap: when to look, what, since when it is due
         self.parameter_queue: deque[str] = deque()
         self.gcs_heard_s = -math.inf
         self._text_id = 0
@@ -108,11 +108,11 @@ class MavlinkLink(ABC):
     def set_interval(self, name: str, interval_us: float) -> None:
         """Stream `name` at this interval: 0 its default, negative off. Faster than 1 kHz is not possible."""
         interval_s = self._defaults.get(name, -1.0) if interval_us == 0 else max(interval_us, _MIN_INTERVAL_US) * 1e-6
-        self._queue = [(due_s, other) for due_s, other in self._queue if other != name]
+        self._queue = [entry for entry in self._queue if entry[1] != name]
         self.streams.pop(name, None)
         if interval_us >= 0 and interval_s >= 0:
             self.streams[name] = interval_s
-            self._queue.append((self._now_s(), name))
+            self._queue.append((self._now_s(), name, self._now_s()))
         heapq.heapify(self._queue)
 
     def interval_us(self, name: str) -> int:
@@ -123,15 +123,16 @@ class MavlinkLink(ABC):
         """Names of the messages whose time has come. A stream that fell behind skips what it missed."""
         now_s, queue = self._now_s(), self._queue
         names: list[str] = []
-        again: list[tuple[float, str]] = []
+        again: list[tuple[float, str, float]] = []
         while queue and queue[0][0] <= now_s + 1e-9:
-            due_s, name = heapq.heappop(queue)
-            interval_s = self.streams[name]
+            _, name, due_s = heapq.heappop(queue)
             if available(name):
                 names.append(name)
-                again.append(((now_s if now_s - due_s > interval_s else due_s) + interval_s, name))
+                behind = now_s - due_s > self.streams[name]
+                next_s = (now_s if behind else due_s) + self.streams[name]
+                again.append((next_s, name, next_s))
             else:
-                again.append((now_s + _LOOK_AGAIN_S, name))
+                again.append((now_s + _LOOK_AGAIN_S, name, due_s))
         for entry in again:
             heapq.heappush(queue, entry)
         return names

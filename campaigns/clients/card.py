@@ -116,7 +116,7 @@ async def parameters(drone: Drone) -> str:
 
 async def telemetry(drone: Drone) -> str:
     """One of everything a program reads."""
-    names = ("position", "home", "attitude_euler", "attitude_quaternion", "velocity_ned", "battery", "gps_info", "odometry")
+    names = ["position", "home", "attitude_euler", "attitude_quaternion", "velocity_ned", "battery", "gps_info", "odometry"]
     names += ("imu", "altitude", "heading", "landed_state", "unix_epoch_time", "scaled_pressure", "distance_sensor")
     values = {name: await asyncio.wait_for(drone.read(name), 5.0) for name in names}
     assert values["gps_info"].num_satellites >= 6

@@ -22,6 +22,14 @@ _FOUND_WITHIN_S = 15.0
 class NativeDrone:
     """`card.Drone` over a MAVSDK 4 system."""
 
+    action: Any
+    geofence: Any
+    log_files: Any
+    mission: Any
+    offboard: Any
+    param: Any
+    telemetry: Any
+
     def __init__(self, system: Any) -> None:
         self.types = SimpleNamespace()
         for name in _PLUGINS:
@@ -32,11 +40,11 @@ class NativeDrone:
 
     async def read(self, name: str) -> Any:
         """The newest value of that name."""
-        return await getattr(self.telemetry, name)()  # type: ignore[attr-defined]
+        return await getattr(self.telemetry, name)()
 
     async def progress(self) -> Any:
         """MissionProgress."""
-        return await self.mission.mission_progress()  # type: ignore[attr-defined]
+        return await self.mission.mission_progress()
 
 
 @asynccontextmanager

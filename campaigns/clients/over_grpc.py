@@ -22,6 +22,13 @@ _TYPES_OF = ("geofence", "mission", "offboard")
 class GrpcDrone:
     """`card.Drone` over a gRPC `System`."""
 
+    action: Any
+    geofence: Any
+    log_files: Any
+    mission: Any
+    offboard: Any
+    param: Any
+
     def __init__(self, system: Any) -> None:
         self._system = system
         self.types = SimpleNamespace()

@@ -46,7 +46,7 @@ def test_two_vehicles_are_flown_at_once_and_apart(two_vehicles: Fleet) -> None:
 
     async def fly(port: int, verbs: dict[str, card.Verb]) -> tuple[list[dict[str, Any]], float]:
         async with connected(f"udpin://127.0.0.1:{port}") as drone:
-            height = await drone.param.get_param_float("RTL_RETURN_ALT")  # type: ignore[attr-defined]
+            height = await drone.param.get_param_float("RTL_RETURN_ALT")
             return await card.perform(drone, verbs), height
 
     two_vehicles.gateways[1].vehicle.autopilot.parameters.set("RTL_RETURN_ALT", 21.0)
