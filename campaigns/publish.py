@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from campaigns.adversaries.report import section
+from campaigns.clients.report import markdown as client_tables
 from campaigns.faults.report import markdown as fault_table
 from campaigns.price import markdown as price_table
 from campaigns.process_death import markdown
@@ -28,6 +29,7 @@ SAFETY = Path("docs/safety.md")
 BEGIN, END = "<!-- results -->", "<!-- end of results -->"
 GATEWAY = Path("docs/gateway.md")
 FAULTS = "<!-- fault campaign -->", "<!-- end of fault campaign -->"
+CLIENTS = "<!-- clients -->", "<!-- end of clients -->"
 FAULT_KINDS = "<!-- fault kinds -->", "<!-- end of fault kinds -->"
 ADVERSARIES = "<!-- adversaries -->", "<!-- end of adversaries -->"
 PRICE = "<!-- price in success -->", "<!-- end of price in success -->"
@@ -147,6 +149,8 @@ def publish() -> None:
     if flown:
         _write_block(SAFETY, *FAULTS, "\n\n".join(fault_campaign(result) for result in flown))
     _write_block(GATEWAY, *FAULT_KINDS, fault_kinds())
+    if "clients" in results:
+        _write_block(GATEWAY, *CLIENTS, client_tables(results["clients"]))
 
 
 def fault_campaign(result: dict[str, Any]) -> str:

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from sim_gateway.attitude_setpoints import AttitudeSetpoint, Thrust
 from sim_gateway.battery import Battery
 from sim_gateway.failsafes import Failsafes
 from sim_gateway.flight_modes import AUTO_MAIN_MODE, CRITICAL, INFO, FlightMode, LandedState, Result, SystemStatus
@@ -39,7 +40,8 @@ READY_AFTER_S = 4.3  # recorded: arming is denied until about here
 _ARMING_DENIED = "Arming denied: Resolve system health failures first"
 _LANDING_DETECT_S = 1.8  # recorded 1.7 to 2.3 s from touch down to "Landing detected"
 _CLIMB_WANTED_M_S = 0.05
-_LIFT_OFF_S = 0.35  # recorded: takeoff is detected about that long after the motors have spooled up
+_LIFT_OFF_S = 0.35  # recorded: takeoff is detected about that long after the motors have spooled up,
+_LIFT_OFF_OFFBOARD_S = 0.65  # and that long in OFFBOARD by velocity
 _RAMP_START_M_S = 0.9  # the takeoff ramp starts as if descending, so that thrust comes up from its minimum
 _KEPT_TEXTS = 200
 _OVERRIDE_AUTO, _OVERRIDE_OFFBOARD = 1, 2  # bits of COM_RC_OVERRIDE
@@ -68,11 +70,15 @@ class ModeChange:
 
 @dataclass(frozen=True, slots=True)
 class ControlOutput:
-    """What the vehicle's velocity loop shall fly: NED m/s, clockwise rad/s. With motors off the rest is zero."""
+    """What the vehicle's velocity loop shall fly: NED m/s, clockwise rad/s. With motors off the rest is zero.
+
+    `thrust`: past the velocity loop, this instead of a velocity.
+    """
 
     motors_on: bool
     velocity: Vector = (0.0, 0.0, 0.0)
     yaw_rate_rad_s: float = 0.0
+    thrust: Thrust | None = None
 
 
 MOTORS_OFF = ControlOutput(False)
@@ -112,7 +118,7 @@ class Autopilot:
         self.target = OffboardSetpoint()
         self.output = MOTORS_OFF
         self._ready_after_s = now_s + self._start_up_s
-        self._setpoint = OffboardSetpoint(velocity=(0.0, 0.0, 0.0))
+        self._setpoint: OffboardSetpoint | AttitudeSetpoint = OffboardSetpoint(velocity=(0.0, 0.0, 0.0))
         self._setpoint_time_s, self._setpoint_fresh = -math.inf, False
         self._after_disarming = FlightMode.LOITER
         self._task: FlightTask | None = None
@@ -174,7 +180,7 @@ class Autopilot:
 
     # ---- requests
 
-    def set_setpoint(self, setpoint: OffboardSetpoint) -> None:
+    def set_setpoint(self, setpoint: OffboardSetpoint | AttitudeSetpoint) -> None:
         """A valid offboard setpoint arrived now."""
         self._setpoint = setpoint
         self._setpoint_time_s, self._setpoint_fresh = self.now_s, True
@@ -263,10 +269,10 @@ class Autopilot:
         self._task_yaw_rad = yaw_rad
         return Result.ACCEPTED
 
-    def enter_failsafe(self, mode: FlightMode) -> None:
-        """A failsafe takes the vehicle over; the intended mode stays."""
+    def enter_failsafe(self, mode: FlightMode, at: Vector | None = None) -> None:
+        """A failsafe takes the vehicle over; the intended mode stays. `at`: where to hold."""
         self.failsafe = True
-        self._task_target = self._task_yaw_rad = None
+        self._task_target, self._task_yaw_rad = at, None
         self._enter(mode)
 
     def leave_failsafe(self) -> None:
@@ -308,7 +314,7 @@ class Autopilot:
         if self._task is None:
             self._task = self._start_task()
         command = self._run(self._task, dt_s)
-        self.output = self._through_takeoff_ramp(command)
+        self.output = self._through_takeoff_ramp(command) if command.thrust is None else self._on_thrust(command)
         self._detect_landing()
         return self.output
 
@@ -322,7 +328,9 @@ class Autopilot:
         self.target = command.target
         if task.landing and not was_landing and isinstance(task, ReturnTask):
             self.say(INFO, "RTL: land at destination")
-        if isinstance(task, TakeoffTask | MissionTask) and task.finished:
+        if isinstance(task, MissionTask) and task.returns:
+            self.return_to_launch()
+        elif isinstance(task, TakeoffTask | MissionTask) and task.finished:
             self._task_target = task.target
             self._task_yaw_rad = self.state.yaw_rad if isinstance(task, MissionTask) else task.state_at_entry.yaw_rad
             self._intend(FlightMode.LOITER)
@@ -392,11 +400,12 @@ class Autopilot:
         get, now_s = self.parameters.get, self.now_s
         north, east, down = command.velocity
         wants_climb = down < -_CLIMB_WANTED_M_S
-        if self.landed and not (wants_climb and now_s - self._armed_at_s >= get("COM_SPOOLUP_TIME") + _LIFT_OFF_S):
+        lift_off_s = _LIFT_OFF_OFFBOARD_S if self.mode is FlightMode.OFFBOARD else _LIFT_OFF_S
+        if self.landed and not (wants_climb and now_s - self._armed_at_s >= get("COM_SPOOLUP_TIME") + lift_off_s):
             return ControlOutput(True)
         if self.landed:
-            self.landed, self._flown, self._ramp_start_s = False, True, now_s
-            self.say(INFO, "Takeoff detected")
+            self._ramp_start_s = now_s
+            self._take_off()
         if self._ramp_start_s is not None:
             share = (now_s - self._ramp_start_s) / max(get("MPC_TKO_RAMP_T"), 0.02)
             climb_limit = -_RAMP_START_M_S + share * (_RAMP_START_M_S + get("MPC_TKO_SPEED"))
@@ -404,6 +413,18 @@ class Autopilot:
             if share >= 1.0:
                 self._ramp_start_s = None
         return ControlOutput(True, (north, east, down), command.yaw_rate_rad_s)
+
+    def _on_thrust(self, command: MotionCommand) -> ControlOutput:
+        """A thrust of the client's own: no ramp, only the time the motors need to spool up."""
+        if self.landed and self.now_s - self._armed_at_s < self.parameters.get("COM_SPOOLUP_TIME"):
+            return ControlOutput(True)
+        if self.landed and not self.state.on_ground:
+            self._take_off()
+        return ControlOutput(True, yaw_rate_rad_s=command.yaw_rate_rad_s, thrust=command.thrust)
+
+    def _take_off(self) -> None:
+        self.landed, self._flown = False, True
+        self.say(INFO, "Takeoff detected")
 
     def _detect_landing(self) -> None:
         """Landed after a while on the ground without wanting up; then the disarm timers run."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from sim_gateway.battery import Charge
 from sim_gateway.flight_modes import CRITICAL, EMERGENCY, WARNING, FlightMode
 from sim_gateway.geofence_monitor import GeofenceMonitor
+from sim_gateway.local_frame import Vector
 
 if TYPE_CHECKING:
     from sim_gateway.autopilot import Autopilot
@@ -101,10 +102,10 @@ class Failsafes:
         self._then = None
         self._enter(mode, text)
 
-    def _enter(self, mode: FlightMode, text: str) -> None:
+    def _enter(self, mode: FlightMode, text: str, at: Vector | None = None) -> None:
         self.latched = True
         self._pilot.say(CRITICAL, text)
-        self._pilot.enter_failsafe(mode)
+        self._pilot.enter_failsafe(mode, at)
 
     def _hold_then(self, mode: FlightMode) -> None:
         """Hold for COM_FAIL_ACT_T, so that somebody can still choose something else, then `mode`."""
@@ -196,7 +197,8 @@ class Failsafes:
         mode = _FENCE_ACTIONS.get(action)
         if action == _FENCE_TERMINATE:
             self._pilot.stop_motors("failsafe")
-        elif mode is FlightMode.LOITER:
-            self.fail_into(mode)
+        elif mode is FlightMode.LOITER:  # where it was found outside: it comes back what it overshoots
+            self._then = None
+            self._enter(mode, ACTIVATED, self._pilot.state.position)
         elif mode is not None and self._pilot.mode is not mode:
             self._hold_then(mode)

@@ -1,12 +1,12 @@
-"""The MAVLink mission protocol for fences and missions: upload, download, clear, as PX4 answers it (geofence.json).
+"""The MAVLink mission protocol for fences, missions and rally points: upload, download, clear, as PX4 answers it (geofence.json).
 
-`geofence_monitor` watches a stored fence, `mission` flies a stored mission.
+`geofence_monitor` watches a stored fence, `mission` flies a stored mission; rally points are kept for those who ask.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import development as mav
@@ -16,7 +16,7 @@ from sim_gateway.local_frame import LocalFrame
 from sim_gateway.mission import Leg
 from sim_gateway.telemetry import Message
 
-FENCE, MISSION = mav.MAV_MISSION_TYPE_FENCE, mav.MAV_MISSION_TYPE_MISSION
+FENCE, MISSION, RALLY = mav.MAV_MISSION_TYPE_FENCE, mav.MAV_MISSION_TYPE_MISSION, mav.MAV_MISSION_TYPE_RALLY
 MAX_ITEMS = 100
 REQUEST_AGAIN_S, GIVE_UP_S = 0.25, 5.0
 _COMMANDS = range(mav.MAV_CMD_NAV_FENCE_RETURN_POINT, mav.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION + 1)
@@ -26,6 +26,7 @@ _INCLUSIONS = (_VERTICES[0], _CIRCLES[0])
 _RELATIVE_FRAMES = (3, 6)
 _FRAMES = (0, 5, 3, 6)  # MAV_FRAME_GLOBAL and GLOBAL_RELATIVE_ALT, as float and as scaled integers
 _SCALED_LIMITS = (900_000_000, 1_800_000_000)  # latitude and longitude, 1e-7 degrees
+_NOWHERE = ((0, 0), (2**31 - 1, 2**31 - 1))  # an item without a place of its own
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +48,11 @@ class _Upload:
     items: list[Item]
     asked_s: float
     heard_s: float
+    send: Callable[[Message], None]
 
 
 class ItemStore:
-    """The fence or the mission of one vehicle, and the protocol around it. `uploads`, `downloads`, `clears`: completed ones."""
+    """The fence, mission or rally points of one vehicle, and the protocol. `uploads`, `downloads`, `clears`: completed ones."""
 
     def __init__(
         self,
@@ -76,8 +78,8 @@ class ItemStore:
             self.on_clear(message, send)
             return
         now_s = self._now_s()
-        self._upload = _Upload(partner, message.count, [], now_s, now_s)
-        self._ask(send)
+        self._upload = _Upload(partner, message.count, [], now_s, now_s, send)
+        self._ask(self._upload)
 
     def on_item(self, message: Message, send: Callable[[Message], None]) -> None:
         """MISSION_ITEM_INT of an upload: the expected one is kept, another one makes it ask again."""
@@ -87,9 +89,9 @@ class ItemStore:
             return
         upload.heard_s = self._now_s()
         if message.seq != len(upload.items):
-            self._ask(send)
+            self._ask(upload)
             return
-        problem = _fence_problem(message) if self.mission_type == FENCE else _mission_problem(message)
+        problem = _PROBLEMS[self.mission_type](message)
         if problem is not None:
             self._upload = None
             send(self._ack(partner, problem))
@@ -97,7 +99,7 @@ class ItemStore:
         params = (message.param1, message.param2, message.param3, message.param4)
         upload.items.append(Item(message.command, message.frame, params, message.x, message.y, message.z))
         if len(upload.items) < upload.count:
-            self._ask(send)
+            self._ask(upload)
             return
         self.items, self._upload = tuple(upload.items), None
         self.uploads += 1
@@ -128,12 +130,16 @@ class ItemStore:
 
     def on_clear(self, message: Message, send: Callable[[Message], None]) -> None:
         """MISSION_CLEAR_ALL: nothing is left."""
+        self.clear()
+        send(self._ack(_sender(message), mav.MAV_MISSION_ACCEPTED))
+
+    def clear(self) -> None:
+        """Forget what is stored and what is being uploaded."""
         self.items, self._upload = (), None
         self.clears += 1
         self._changed(())
-        send(self._ack(_sender(message), mav.MAV_MISSION_ACCEPTED))
 
-    def poll(self, send: Callable[[Message], None]) -> None:
+    def poll(self) -> None:
         """Ask again for an item that does not come; give an upload up that has fallen silent."""
         upload = self._upload
         if upload is None:
@@ -141,18 +147,16 @@ class ItemStore:
         now_s = self._now_s()
         if now_s - upload.heard_s > GIVE_UP_S:
             self._upload = None
-            send(self._ack(upload.partner, mav.MAV_MISSION_OPERATION_CANCELLED))
+            upload.send(self._ack(upload.partner, mav.MAV_MISSION_OPERATION_CANCELLED))
         elif now_s - upload.asked_s > REQUEST_AGAIN_S:
-            self._ask(send)
+            self._ask(upload)
 
     def _ack(self, partner: tuple[int, int], result: int) -> Message:
         return mav.MAVLink_mission_ack_message(*partner, result, self.mission_type)
 
-    def _ask(self, send: Callable[[Message], None]) -> None:
-        upload = self._upload
-        if upload is not None:
-            upload.asked_s = self._now_s()
-            send(mav.MAVLink_mission_request_int_message(*upload.partner, len(upload.items), self.mission_type))
+    def _ask(self, upload: _Upload) -> None:
+        upload.asked_s = self._now_s()
+        upload.send(mav.MAVLink_mission_request_int_message(*upload.partner, len(upload.items), self.mission_type))
 
 
 def shapes(items: tuple[Item, ...], frame: LocalFrame) -> list[Shape]:
@@ -178,10 +182,10 @@ def _place(item: Item, frame: LocalFrame) -> tuple[float, float]:
 
 
 def legs(items: tuple[Item, ...], frame: LocalFrame) -> tuple[Leg, ...]:
-    """Mission items in local coordinates; without a place of their own they are where the vehicle is."""
+    """Mission items in local coordinates; without a place or height of their own they are where the vehicle is."""
     found = []
     for item in items:
-        nowhere = item.frame == mav.MAV_FRAME_MISSION or (item.latitude_e7, item.longitude_e7) == (0, 0)
+        nowhere = item.frame == mav.MAV_FRAME_MISSION or (item.latitude_e7, item.longitude_e7) in _NOWHERE
         north, east = (math.nan, math.nan) if nowhere else _place(item, frame)
         above_home = item.frame in _RELATIVE_FRAMES
         altitude = item.altitude_m if above_home else item.altitude_m - frame.altitude_m
@@ -190,22 +194,30 @@ def legs(items: tuple[Item, ...], frame: LocalFrame) -> tuple[Leg, ...]:
 
 
 def _mission_problem(message: Message) -> int | None:
+    """MAV_MISSION_RESULT of an item that cannot be stored, or None. A height may be missing: a return needs none."""
     if message.frame not in (*_FRAMES, mav.MAV_FRAME_MISSION):
         return int(mav.MAV_MISSION_UNSUPPORTED_FRAME)
-    if abs(message.x) > _SCALED_LIMITS[0] or abs(message.y) > _SCALED_LIMITS[1] or not math.isfinite(message.z):
-        return int(mav.MAV_MISSION_INVALID)
-    return None
+    return None if (message.x, message.y) in _NOWHERE or _on_earth(message) else int(mav.MAV_MISSION_INVALID)
 
 
-def _fence_problem(message: Message) -> int | None:
-    """MAV_MISSION_RESULT of an item that cannot be stored, or None."""
-    if message.command not in _COMMANDS:
+def _on_earth(message: Message) -> bool:
+    return bool(abs(message.x) <= _SCALED_LIMITS[0] and abs(message.y) <= _SCALED_LIMITS[1])
+
+
+def _place_problem(message: Message, commands: Sequence[int]) -> int | None:
+    """The same for items that are nothing but a place."""
+    if message.command not in commands:
         return int(mav.MAV_MISSION_UNSUPPORTED)
     if message.frame not in _FRAMES:
         return int(mav.MAV_MISSION_UNSUPPORTED_FRAME)
-    if abs(message.x) > _SCALED_LIMITS[0] or abs(message.y) > _SCALED_LIMITS[1] or not math.isfinite(message.param1):
-        return int(mav.MAV_MISSION_INVALID)
-    return None
+    return None if _on_earth(message) and math.isfinite(message.param1) else int(mav.MAV_MISSION_INVALID)
+
+
+_PROBLEMS: dict[int, Callable[[Message], int | None]] = {
+    FENCE: lambda message: _place_problem(message, _COMMANDS),
+    MISSION: _mission_problem,
+    RALLY: lambda message: _place_problem(message, (mav.MAV_CMD_NAV_RALLY_POINT,)),
+}
 
 
 def _sender(message: Message) -> tuple[int, int]:

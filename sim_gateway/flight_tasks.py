@@ -7,9 +7,10 @@ velocity references limited in acceleration. Gains and limits are read from PX4'
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
+from sim_gateway.attitude_setpoints import AttitudeLaw, AttitudeSetpoint, Thrust, thrust_for
 from sim_gateway.local_frame import NedState, Vector, wrap_pi
 from sim_gateway.parameters import ParameterStore
 from sim_gateway.setpoints import NAN, NOTHING, OffboardSetpoint
@@ -26,11 +27,12 @@ _TAKEOFF_AT_LEAST_S = 1.5  # recorded: a takeoff in the air is over after about 
 
 @dataclass(frozen=True, slots=True)
 class MotionCommand:
-    """What a task wants now; `target` is what POSITION_TARGET_LOCAL_NED reports."""
+    """What a task wants now; `target` is what POSITION_TARGET_LOCAL_NED reports. With `thrust`, that instead of a velocity."""
 
     velocity: Vector
     yaw_rate_rad_s: float
     target: OffboardSetpoint
+    thrust: Thrust | None = None
 
 
 class FlightTask(Protocol):
@@ -97,7 +99,7 @@ class _Motion:
 
 @dataclass(slots=True)
 class HoldTask:
-    """AUTO.LOITER: brake, then stay. With a target it flies there instead, at cruise speed."""
+    """AUTO.LOITER: brake, then stay; on the ground, idle. With a target it flies there instead, at cruise speed."""
 
     parameters: ParameterStore
     state_at_entry: NedState
@@ -119,7 +121,8 @@ class HoldTask:
         if self.target is None:
             velocity = self._motion.towards(_ZERO, dt_s)
             slow = velocity == _ZERO and math.dist(state.velocity, _ZERO) < _STOPPED_M_S
-            if slow or state.time_s - self.state_at_entry.time_s > _BRAKE_TIMEOUT_S:
+            stopped = slow or state.time_s - self.state_at_entry.time_s > _BRAKE_TIMEOUT_S
+            if stopped and not state.on_ground:  # on the ground PX4 idles: to hold a noisy estimate there would be to take off
                 self.target = state.position
             return MotionCommand(velocity, yaw_rate, OffboardSetpoint(NOTHING, velocity, NOTHING, self.yaw_rad, 0.0))
         get = self.parameters.get
@@ -276,23 +279,43 @@ class OffboardTask:
     """OFFBOARD: fly the newest setpoint. What PX4 cannot fly (an axis without setpoint) becomes a stop."""
 
     parameters: ParameterStore
-    setpoint: OffboardSetpoint
+    setpoint: OffboardSetpoint | AttitudeSetpoint
     finished: bool = False
     landing: bool = False
+    _attitude: AttitudeLaw = field(default_factory=AttitudeLaw)
 
     def update(self, state: NedState, dt_s: float) -> MotionCommand:
         """Setpoint within the vehicle's limits."""
-        given = self.setpoint
-        wanted = tuple(self._axis(i, state) for i in range(3)) if given.flyable else _ZERO
+        if isinstance(self.setpoint, AttitudeSetpoint):
+            return self._fly_attitude(self.setpoint, state, dt_s)
+        self._attitude = AttitudeLaw()
+        if self.setpoint.only_acceleration:
+            return self._fly_acceleration(self.setpoint, state)
+        return self._fly_motion(self.setpoint, state)
+
+    def _fly_acceleration(self, given: OffboardSetpoint, state: NedState) -> MotionCommand:
+        tilt = math.radians(self.parameters.get("MPC_TILTMAX_AIR"))
+        target = replace(given, yaw_rad=given.yaw_rad if math.isfinite(given.yaw_rad) else state.yaw_rad)
+        yaw_rate = self._yaw_rate(given.yaw_rad, given.yaw_rate_rad_s, state)
+        return MotionCommand((0.0, 0.0, given.acceleration[2]), yaw_rate, target, thrust_for(given.acceleration, tilt))
+
+    def _fly_attitude(self, given: AttitudeSetpoint, state: NedState, dt_s: float) -> MotionCommand:
+        thrust = self._attitude.update(given, state.yaw_rad, dt_s)
+        yaw, rate = self._attitude.yaw_rad, given.yaw_rate_rad_s
+        return MotionCommand(_ZERO, self._yaw_rate(yaw, rate, state), OffboardSetpoint(), thrust)
+
+    def _fly_motion(self, given: OffboardSetpoint, state: NedState) -> MotionCommand:
+        wanted = tuple(self._axis(given, i, state) for i in range(3)) if given.flyable else _ZERO
         velocity = limit_velocity((wanted[0], wanted[1], wanted[2]), self.parameters)
         held = given.position if given.flyable else NOTHING
         yaw = given.yaw_rad if math.isfinite(given.yaw_rad) else state.yaw_rad
         rate = given.yaw_rate_rad_s if math.isfinite(given.yaw_rate_rad_s) else 0.0
-        return MotionCommand(velocity, self._yaw_rate(state), OffboardSetpoint(held, velocity, NOTHING, yaw, rate))
+        yaw_rate = self._yaw_rate(given.yaw_rad, given.yaw_rate_rad_s, state)
+        return MotionCommand(velocity, yaw_rate, OffboardSetpoint(held, velocity, NOTHING, yaw, rate))
 
-    def _axis(self, i: int, state: NedState) -> float:
-        """Velocity wanted along one axis: position error plus feed-forward, velocity, or what makes the acceleration."""
-        given, get = self.setpoint, self.parameters.get
+    def _axis(self, given: OffboardSetpoint, i: int, state: NedState) -> float:
+        """Velocity wanted along one axis: position error plus feed-forward, velocity, or (beside those) an acceleration."""
+        get = self.parameters.get
         if math.isfinite(given.position[i]):
             gain = get("MPC_XY_P") if i < 2 else get("MPC_Z_P")
             feed_forward = given.velocity[i] if math.isfinite(given.velocity[i]) else 0.0
@@ -303,11 +326,11 @@ class OffboardTask:
         gain = get("MPC_XY_VEL_P_ACC") if i < 2 else get("MPC_Z_VEL_P_ACC")
         return state.velocity[i] + given.acceleration[i] / gain
 
-    def _yaw_rate(self, state: NedState) -> float:
+    def _yaw_rate(self, yaw_rad: float, rate_rad_s: float, state: NedState) -> float:
         limit = math.radians(self.parameters.get("MC_YAWRATE_MAX"))
-        rate = self.setpoint.yaw_rate_rad_s if math.isfinite(self.setpoint.yaw_rate_rad_s) else 0.0
-        if math.isfinite(self.setpoint.yaw_rad):
-            rate += self.parameters.get("MC_YAW_P") * wrap_pi(self.setpoint.yaw_rad - state.yaw_rad)
+        rate = rate_rad_s if math.isfinite(rate_rad_s) else 0.0
+        if math.isfinite(yaw_rad):
+            rate += self.parameters.get("MC_YAW_P") * wrap_pi(yaw_rad - state.yaw_rad)
         return _clamp(rate, -limit, limit)
 
 

@@ -6,6 +6,7 @@ Nothing blocks; everything that could grow is bounded. Link faults act here, on 
 from __future__ import annotations
 
 import errno
+import heapq
 import logging
 import math
 import socket
@@ -13,7 +14,6 @@ import struct
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import development as mav
 
@@ -30,6 +30,7 @@ _PEER_TIMEOUT_S = 10.0
 _GCS_TIMEOUT_S = 5.0
 _TEXT_CHUNK = 50
 _MIN_INTERVAL_US = 1000.0
+_LOOK_AGAIN_S = 0.02  # whether a message that start-up has not reached can be sent now
 _MEMORY_MESSAGES = 100_000
 
 _log = logging.getLogger("sim_gateway.mavlink")
@@ -37,12 +38,6 @@ _log = logging.getLogger("sim_gateway.mavlink")
 
 class PortInUseError(OSError):
     """A port the gateway needs is taken; the message names it."""
-
-
-@dataclass(slots=True)
-class _Stream:
-    interval_s: float
-    due_s: float
 
 
 def _bind(port: int, purpose: str) -> socket.socket:
@@ -65,10 +60,10 @@ class MavlinkLink(ABC):
         self.faults: LinkFaults | None = None
         self._now_s = now_s
         self._defaults = {n: 1.0 / rates[column] for n, rates in STREAM_RATES_HZ.items() if rates[column] > 0}
-        self.streams = {name: _Stream(interval, 0.0) for name, interval in self._defaults.items()}
+        self.streams = dict(self._defaults)  # name: interval, s
+        self._queue = [(0.0, name, 0.0) for name in self.streams]  # a heap: when to look, what, since when it is due
         self.parameter_queue: deque[str] = deque()
         self.gcs_heard_s = -math.inf
-        self._next_due_s = -math.inf
         self._text_id = 0
 
     @property
@@ -113,29 +108,33 @@ class MavlinkLink(ABC):
     def set_interval(self, name: str, interval_us: float) -> None:
         """Stream `name` at this interval: 0 its default, negative off. Faster than 1 kHz is not possible."""
         interval_s = self._defaults.get(name, -1.0) if interval_us == 0 else max(interval_us, _MIN_INTERVAL_US) * 1e-6
-        if interval_us < 0 or interval_s < 0:
-            self.streams.pop(name, None)
-        else:
-            self.streams[name] = _Stream(interval_s, self._now_s())
-        self._next_due_s = -math.inf
+        self._queue = [entry for entry in self._queue if entry[1] != name]
+        self.streams.pop(name, None)
+        if interval_us >= 0 and interval_s >= 0:
+            self.streams[name] = interval_s
+            self._queue.append((self._now_s(), name, self._now_s()))
+        heapq.heapify(self._queue)
 
     def interval_us(self, name: str) -> int:
         """The interval in force; -1 when the message is not streamed."""
-        stream = self.streams.get(name)
-        return -1 if stream is None else round(stream.interval_s * 1e6)
+        return round(self.streams[name] * 1e6) if name in self.streams else -1
 
     def due(self, available: Callable[[str], bool]) -> list[str]:
         """Names of the messages whose time has come. A stream that fell behind skips what it missed."""
+        now_s, queue = self._now_s(), self._queue
         names: list[str] = []
-        now_s = self._now_s()
-        if now_s < self._next_due_s - 1e-9:
-            return names
-        for name, stream in self.streams.items():
-            if now_s >= stream.due_s - 1e-9 and available(name):
+        again: list[tuple[float, str, float]] = []
+        while queue and queue[0][0] <= now_s + 1e-9:
+            _, name, due_s = heapq.heappop(queue)
+            if available(name):
                 names.append(name)
-                behind = now_s - stream.due_s > stream.interval_s
-                stream.due_s = now_s + stream.interval_s if behind else stream.due_s + stream.interval_s
-        self._next_due_s = min((stream.due_s for stream in self.streams.values()), default=math.inf)
+                behind = now_s - due_s > self.streams[name]
+                next_s = (now_s if behind else due_s) + self.streams[name]
+                again.append((next_s, name, next_s))
+            else:
+                again.append((now_s + _LOOK_AGAIN_S, name, due_s))
+        for entry in again:
+            heapq.heappush(queue, entry)
         return names
 
     # ---- in

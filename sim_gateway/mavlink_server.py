@@ -11,9 +11,11 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import development as mav
 
+from sim_gateway.attitude_setpoints import read_attitude_target
 from sim_gateway.autopilot import Autopilot
 from sim_gateway.commands import Command, CommandHandler
-from sim_gateway.fence import FENCE, MISSION, ItemStore, legs, shapes
+from sim_gateway.fence import MISSION, RALLY, ItemStore, legs, shapes
+from sim_gateway.file_server import FileServer
 from sim_gateway.flight_modes import CRITICAL, FlightMode, Result
 from sim_gateway.local_frame import LocalFrame
 from sim_gateway.log_server import LogServer
@@ -56,9 +58,11 @@ class MavlinkServer:
         self._shown_landed = -1
         self.fence = ItemStore(self._now, lambda items: autopilot.failsafes.geofence.set_shapes(shapes(items, frame)))
         self.mission = ItemStore(self._now, lambda items: autopilot.mission.replace(legs(items, frame)), MISSION)
-        self._stores = {FENCE: self.fence, MISSION: self.mission}
+        rally = ItemStore(self._now, mission_type=RALLY)
+        self._stores = {store.mission_type: store for store in (self.fence, self.mission, rally)}
         self.vehicle_log = VehicleLog(autopilot)
         self._log_server = LogServer(self.vehicle_log)
+        self._file_server = FileServer(self.vehicle_log)
         self.wire_log = WireLog(self._now)
         self._handlers: dict[str, Callable[[Message, MavlinkLink], None]] = {
             "HEARTBEAT": self._on_heartbeat,
@@ -67,11 +71,12 @@ class MavlinkServer:
             "SET_MODE": self._on_set_mode,
             "SET_POSITION_TARGET_LOCAL_NED": self._on_local_setpoint,
             "SET_POSITION_TARGET_GLOBAL_INT": self._on_global_setpoint,
+            "SET_ATTITUDE_TARGET": self._on_attitude_target,
             "PARAM_REQUEST_LIST": self._on_param_list,
             "PARAM_REQUEST_READ": self._on_param_read,
             "PARAM_SET": self._on_param_set,
-            "MISSION_REQUEST_LIST": self._on_mission_list,
-            "MISSION_COUNT": self._on_mission_count,
+            "MISSION_REQUEST_LIST": self._for_store(ItemStore.on_list),
+            "MISSION_COUNT": self._for_store(ItemStore.on_count),
             "MISSION_CLEAR_ALL": self._on_mission_clear,
             "MISSION_SET_CURRENT": self._on_mission_set_current,
             "MISSION_ITEM_INT": self._for_store(ItemStore.on_item),
@@ -81,6 +86,7 @@ class MavlinkServer:
             "LOG_REQUEST_DATA": lambda m, link: self._log_server.on_data(m, link.send),
             "LOG_REQUEST_END": lambda m, link: self._log_server.on_end(m, link.send),
             "LOG_ERASE": lambda m, link: self._log_server.on_erase(m, link.send),
+            "FILE_TRANSFER_PROTOCOL": lambda m, link: self._file_server.on_request(m, link.send),
             "MANUAL_CONTROL": self._on_manual_control,
             "TIMESYNC": self._on_timesync,
             "PING": self._on_ping,
@@ -113,9 +119,10 @@ class MavlinkServer:
         self._send_changes()
         self.vehicle_log.watch()
         self._log_server.poll()
+        self._file_server.poll()
+        for store in self._stores.values():
+            store.poll()
         for link in self.links:
-            self.fence.poll(link.send)
-            self.mission.poll(link.send)
             for name in link.due(self._telemetry.available):
                 link.send(self._telemetry.build(name))
             for _ in range(min(_PARAMS_PER_POLL, len(link.parameter_queue))):
@@ -228,6 +235,12 @@ class MavlinkServer:
             return
         pilot.set_setpoint(setpoint)
 
+    def _on_attitude_target(self, m: Message, _: MavlinkLink) -> None:
+        rates = (m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate)
+        setpoint = read_attitude_target(m.type_mask, tuple(m.q), rates, m.thrust)
+        if setpoint is not None:
+            self._autopilot.set_setpoint(setpoint)
+
     # ---- parameters
 
     def _send_parameter(self, name: str, link: MavlinkLink) -> None:
@@ -256,7 +269,7 @@ class MavlinkServer:
             for other in (link, *(x for x in self.links if x is not link)):
                 self._send_parameter(name, other)
 
-    # ---- fence and mission; rally points: a client that asks gets an empty list
+    # ---- fence, mission and rally points
 
     def _for_store(
         self, handler: Callable[[ItemStore, Message, Callable[[Message], None]], None]
@@ -267,26 +280,14 @@ class MavlinkServer:
 
         return handle
 
-    def _on_mission_list(self, m: Message, link: MavlinkLink) -> None:
-        if m.mission_type in self._stores:
-            self._stores[m.mission_type].on_list(m, link.send)
-            return
-        link.send(mav.MAVLink_mission_count_message(m.get_srcSystem(), m.get_srcComponent(), 0, m.mission_type))
-
-    def _on_mission_count(self, m: Message, link: MavlinkLink) -> None:
-        if m.mission_type in self._stores:
-            self._stores[m.mission_type].on_count(m, link.send)
-            return
-        result = mav.MAV_MISSION_ACCEPTED if m.count == 0 else mav.MAV_MISSION_UNSUPPORTED
-        link.send(mav.MAVLink_mission_ack_message(m.get_srcSystem(), m.get_srcComponent(), result, m.mission_type))
-
     def _on_mission_clear(self, m: Message, link: MavlinkLink) -> None:
-        for kind, store in self._stores.items():
-            if m.mission_type in (kind, mav.MAV_MISSION_TYPE_ALL):
-                store.on_clear(m, link.send)
-        if m.mission_type == mav.MAV_MISSION_TYPE_RALLY:
-            ack = mav.MAV_MISSION_ACCEPTED
-            link.send(mav.MAVLink_mission_ack_message(m.get_srcSystem(), m.get_srcComponent(), ack, m.mission_type))
+        if m.mission_type in self._stores:
+            self._stores[m.mission_type].on_clear(m, link.send)
+        elif m.mission_type == mav.MAV_MISSION_TYPE_ALL:
+            for store in self._stores.values():
+                store.clear()
+            sender = (m.get_srcSystem(), m.get_srcComponent())
+            link.send(mav.MAVLink_mission_ack_message(*sender, mav.MAV_MISSION_ACCEPTED, m.mission_type))
 
     def _on_mission_set_current(self, m: Message, _: MavlinkLink) -> None:
         if self._autopilot.mission.set_current(m.seq):

@@ -1,7 +1,7 @@
 """Missions: the uploaded items, which one is current, and how AUTO.MISSION flies them one after the other.
 
-Flown: takeoff, waypoint, loiter for a time, land, return, change of speed. Other commands are passed over, as PX4 does with those
-that its hardware lacks. The protocol is in `fence` (`ItemStore`).
+Flown: takeoff, waypoint, loiter for a time, land, return (which leaves the mission for that mode), change of speed. Others
+are passed over, as PX4 does with those that its hardware lacks. The protocol is in `fence` (`ItemStore`).
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import development as mav
 
-from sim_gateway.flight_tasks import FlightTask, HoldTask, LandTask, MotionCommand, ReturnTask, TakeoffTask
+from sim_gateway.flight_tasks import FlightTask, HoldTask, LandTask, MotionCommand, TakeoffTask
 from sim_gateway.local_frame import NedState, Vector
 from sim_gateway.parameters import ParameterStore
 
 _TURN_FROM_M = 1.0  # nearer than this the vehicle does not turn towards a waypoint
 _STAYS = (mav.MAV_CMD_NAV_WAYPOINT, mav.MAV_CMD_NAV_LOITER_TIME)
-FLOWN = (*_STAYS, mav.MAV_CMD_NAV_TAKEOFF, mav.MAV_CMD_NAV_LAND, mav.MAV_CMD_NAV_RETURN_TO_LAUNCH)
+FLOWN = (*_STAYS, mav.MAV_CMD_NAV_TAKEOFF, mav.MAV_CMD_NAV_LAND)
 
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """One item: local north and east (not finite: where the vehicle is), altitude above home or in local up (`above_home`)."""
+    """One item: local north and east, altitude above home or in local up (`above_home`); not finite: where the vehicle is."""
 
     command: int
     north_m: float
@@ -35,6 +35,7 @@ class Leg:
     def target(self, here: Vector, home: Vector) -> Vector:
         """Where it ends, local NED."""
         down = home[2] - self.altitude_m if self.above_home else -self.altitude_m
+        down = down if math.isfinite(down) else here[2]
         north, east = (self.north_m, self.east_m) if math.isfinite(self.north_m) else here[:2]
         return (north, east, down)
 
@@ -66,7 +67,10 @@ class Mission:
 
 @dataclass(slots=True)
 class MissionTask:
-    """AUTO.MISSION: fly the items from the current one on. `finished`: there is none left, and it was no landing."""
+    """AUTO.MISSION: fly the items from the current one on. `finished`: there is none left, and it was no landing.
+
+    `returns`: a return was reached, for the autopilot to change its mode.
+    """
 
     parameters: ParameterStore
     state_at_entry: NedState
@@ -74,6 +78,7 @@ class MissionTask:
     home: Vector
     finished: bool = False
     landing: bool = False
+    returns: bool = False
     _part: FlightTask | None = None
     _flying: int = -1
     _there_since_s: float | None = None
@@ -100,18 +105,19 @@ class MissionTask:
     def _begin(self, state: NedState) -> None:
         """Start the current item; those that fly nowhere are done at once."""
         mission, self._there_since_s = self.mission, None
-        while mission.current < len(mission.legs) and mission.legs[mission.current].command not in FLOWN:
+        while not (self.returns or mission.complete) and mission.legs[mission.current].command not in FLOWN:
             self._do(mission.legs[mission.current])
             mission.reached.append(mission.current)
             mission.current += 1
         self._flying = mission.current
-        self.finished = mission.complete
-        if not self.finished:
+        self.finished = mission.complete and not self.returns
+        if not (mission.complete or self.returns):
             self._part = self._task_of(mission.legs[mission.current], state)
         elif self._part is None:
             self._part = HoldTask(self.parameters, state)
 
     def _do(self, leg: Leg) -> None:
+        self.returns = leg.command == mav.MAV_CMD_NAV_RETURN_TO_LAUNCH
         if leg.command == mav.MAV_CMD_DO_CHANGE_SPEED and leg.params[1] > 0.0:
             self.parameters.set("MPC_XY_CRUISE", leg.params[1])
 
@@ -121,8 +127,6 @@ class MissionTask:
             return TakeoffTask(self.parameters, state, min(target[2], state.position[2]))
         if leg.command == mav.MAV_CMD_NAV_LAND:
             return LandTask(self.parameters, state, self.home[2], target=(target[0], target[1], self.home[2]))
-        if leg.command == mav.MAV_CMD_NAV_RETURN_TO_LAUNCH:
-            return ReturnTask(self.parameters, state, self.home)
         return HoldTask(self.parameters, state, target, self._heading(leg, state, target))
 
     def _heading(self, leg: Leg, state: NedState, target: Vector) -> float:

@@ -69,7 +69,12 @@ class PilotedVehicle:
         self._snapshot = None
 
     def _fly(self, n_steps: int, output: ControlOutput) -> None:
-        if output.motors_on:
+        if output.thrust is not None:
+            thrust = output.thrust
+            share = thrust.share * self.simulation.hover_thrust if thrust.of_hover else thrust.share
+            up = self.frame.vector_to_world(thrust.direction)
+            self.simulation.advance_thrust(n_steps, up, share, -output.yaw_rate_rad_s)
+        elif output.motors_on:
             self.simulation.advance(n_steps, self.frame.vector_to_world(output.velocity), -output.yaw_rate_rad_s)
         else:
             self.simulation.advance_motors_off(n_steps)

@@ -29,6 +29,12 @@ class OffboardSetpoint:
     yaw_rate_rad_s: float = NAN
 
     @property
+    def only_acceleration(self) -> bool:
+        """Whether it asks for an acceleration and nothing else."""
+        others = (*self.position, *self.velocity)
+        return all(map(math.isfinite, self.acceleration)) and not any(map(math.isfinite, others))
+
+    @property
     def flyable(self) -> bool:
         """Whether each axis is controlled, and x and y by the same kind. PX4 hovers on a setpoint that is not."""
         kinds = (self.position, self.velocity, self.acceleration)

@@ -40,18 +40,21 @@ from sim_gateway.scan_faults import ScanFaults
 from sim_gateway.scene import Boxes, Point, World
 from sim_gateway.vehicle import (
     ACC,
+    BODY_Z_SP,
     LANDED,
     OMEGA,
+    PHASE,
     POS,
     QUAT,
     STEP_S,
+    THRUST_SP,
     VEL,
     initial_state,
     roll_pitch_rad,
     rotation,
     yaw_rad,
 )
-from sim_gateway.vehicle_params import VehicleParams
+from sim_gateway.vehicle_params import HOVER_THRUST, VehicleParams
 
 Array = NDArray[np.float64]
 
@@ -230,6 +233,22 @@ class Simulation:
         if setpoint.shape != (3,) or not all(map(math.isfinite, (*setpoint.tolist(), yaw_rate_sp))):
             raise ValueError(f"setpoint {velocity_sp}, {yaw_rate_sp}: give three finite velocities and a finite yaw rate")
         self._step(n_steps, setpoint, float(yaw_rate_sp), motors_on=True)
+
+    @property
+    def hover_thrust(self) -> float:
+        """The collective thrust, share of the motors', that the autopilot takes for hovering."""
+        return float(self._params[HOVER_THRUST])
+
+    def advance_thrust(self, n_steps: int, direction: Sequence[float] | Array, thrust: float, yaw_rate_sp: float) -> None:
+        """Fly `n_steps` of 4 ms past the velocity loop: collective `thrust` (0 to 1 of the motors') along a unit vector (world).
+
+        On the ground it lifts off when that carries the weight. Raises what `advance` raises.
+        """
+        if not all(map(math.isfinite, (*direction, thrust, yaw_rate_sp))):
+            raise ValueError(f"thrust {thrust} along {direction}, {yaw_rate_sp}: give finite values")
+        self._state[BODY_Z_SP : BODY_Z_SP + 3], self._state[THRUST_SP] = direction, min(max(thrust, 0.0), 1.0)
+        self._state[PHASE] = n_steps  # the velocity loop's turn comes after these
+        self._step(n_steps, np.zeros(3), float(yaw_rate_sp), motors_on=True)
 
     def carry(self, position_m: Sequence[float], yaw_rad: float, velocity_m_s: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         """Put the vehicle there, level, as a hand would: the next step starts from this motion (corridor frame)."""

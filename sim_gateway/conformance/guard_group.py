@@ -13,7 +13,10 @@ from sim_gateway.conformance.rows import BATTERY_S, DISTANCE_M, EVENT_S, Row, Ta
 WATCHED_S = 5.95  # the recordings end 5.8 to 6.0 s after the crossing
 _FENCE = mav.MAV_MISSION_TYPE_FENCE
 _CORNERS_M = ((10.0, 10.0), (10.0, -10.0), (-10.0, -10.0), (-10.0, 10.0))
-REASONS = {"inject gps_off": "GPS can be lost here, as in PX4's other simulators; the recorded one could not"}
+REASONS = {
+    "inject gps_off": "GPS can be lost here, as in PX4's other simulators; the recorded one could not",
+    "hor, GF_ACTION 2: in the end": "Hold is where a look found the vehicle outside, in PX4 0.2 s later here",
+}
 
 
 # ---- geofence
@@ -21,7 +24,7 @@ REASONS = {"inject gps_off": "GPS can be lost here, as in PX4's other simulators
 
 def geofence(facts: Json) -> list[Row]:
     """Breaches of a square, of the greatest height and of the greatest distance."""
-    table = Table("geofence")
+    table = Table("geofence", REASONS)
     for case, recorded in facts.items():
         _breach(table, case, recorded)
     return table.rows

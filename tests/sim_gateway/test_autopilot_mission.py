@@ -98,3 +98,52 @@ def test_no_mission_in_the_air_is_refused() -> None:
     bench = Bench(5.0)
     bench.command(mav.MAV_CMD_MISSION_START).run(0.1)
     assert bench.acks(mav.MAV_CMD_MISSION_START, 0.0) == ["TEMPORARILY_REJECTED"]
+
+
+def test_a_return_needs_no_place_and_no_height() -> None:
+    """As MAVSDK uploads "return after the mission"."""
+    bench = Bench()
+    bench.onboard.send(mav.MAVLink_mission_count_message(1, 1, 2, 0))
+    latitude, longitude, _ = bench.vehicle.frame.to_global((6.0, 0.0, 0.0))
+    waypoint = (6, mav.MAV_CMD_NAV_WAYPOINT, 0, 1, 0, 1.0, 0, NAN, round(latitude * 1e7), round(longitude * 1e7), 4.0)
+    back = (2, mav.MAV_CMD_NAV_RETURN_TO_LAUNCH, 0, 1, NAN, NAN, NAN, NAN, 2**31 - 1, 2**31 - 1, NAN)
+    for number, item in enumerate((waypoint, back)):
+        bench.run(0.04).onboard.send(mav.MAVLink_mission_item_int_message(1, 1, number, *item, 0))
+    assert bench.run(0.1).named("MISSION_ACK")[-1][1].type == mav.MAV_MISSION_ACCEPTED
+    start(bench)
+    bench.run(30.0, until=lambda: bench.mode == "AUTO.RTL")
+    assert bench.mode == "AUTO.RTL"
+    bench.run(0.2)
+    assert [m.seq for _, m in bench.named("MISSION_ITEM_REACHED")] == [0, 1]  # by the last one MAVSDK knows that it is done
+    assert bench.telemetry.build("MISSION_CURRENT").mission_state == mav.MISSION_STATE_COMPLETE
+    bench.run(60.0, until=lambda: not bench.pilot.armed)
+    assert not bench.pilot.armed
+    assert math.hypot(*bench.pilot.state.position[:2]) < 0.5
+
+
+def test_rally_points_are_kept_apart_from_the_mission() -> None:
+    bench = Bench()
+    upload(bench, FLIGHT)
+    bench.onboard.send(mav.MAVLink_mission_count_message(1, 1, 1, mav.MAV_MISSION_TYPE_RALLY))
+    place = (bench.vehicle.frame.to_global((5.0, 5.0, 0.0))[:2], 10.0)
+    point = (round(place[0][0] * 1e7), round(place[0][1] * 1e7), place[1])
+    item = (0, 6, mav.MAV_CMD_NAV_RALLY_POINT, 0, 1, 0, 0, 0, 0, *point, mav.MAV_MISSION_TYPE_RALLY)
+    bench.run(0.04).onboard.send(mav.MAVLink_mission_item_int_message(1, 1, *item))
+    ack = bench.run(0.1).named("MISSION_ACK")[-1][1]
+    assert (ack.type, ack.mission_type) == (mav.MAV_MISSION_ACCEPTED, mav.MAV_MISSION_TYPE_RALLY)
+    for kind, count in ((0, len(FLIGHT)), (mav.MAV_MISSION_TYPE_RALLY, 1)):
+        bench.onboard.send(mav.MAVLink_mission_request_list_message(1, 1, kind))
+        assert bench.run(0.1).named("MISSION_COUNT")[-1][1].count == count
+    bench.onboard.send(mav.MAVLink_mission_clear_all_message(1, 1, mav.MAV_MISSION_TYPE_ALL))
+    acks = [m for _, m in bench.run(0.1).named("MISSION_ACK", bench.time_s - 0.11)]
+    assert [(m.type, m.mission_type) for m in acks] == [(mav.MAV_MISSION_ACCEPTED, mav.MAV_MISSION_TYPE_ALL)]
+    bench.onboard.send(mav.MAVLink_mission_request_list_message(1, 1, 0))
+    assert bench.run(0.1).named("MISSION_COUNT")[-1][1].count == 0
+
+
+def test_a_lost_item_is_asked_for_again_on_the_link_of_the_upload() -> None:
+    bench = Bench()
+    bench.onboard.send(mav.MAVLink_mission_count_message(1, 1, 2, 0))
+    bench.run(1.0)
+    assert 3 <= len(bench.named("MISSION_REQUEST_INT")) <= 6
+    assert bench.named("MISSION_REQUEST_INT", client=bench.ground) == []

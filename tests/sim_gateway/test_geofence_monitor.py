@@ -86,3 +86,15 @@ def test_what_is_done_about_a_breach(action: int, modes: list[str], armed: bool)
     assert [m[1] for m in bench.modes(since_s)] == modes
     assert bench.pilot.armed == armed
     assert (TOO_FAR in [text for _, _, text in bench.texts(since_s)]) == (action != 0)
+
+
+def test_hold_comes_back_to_where_the_breach_was_found() -> None:
+    bench = Bench(5.0, parameters={"GF_ACTION": 2, "GF_MAX_HOR_DIST": 6.0}).offboard(2.0)
+    bench.run(15.0, until=lambda: bench.mode == "AUTO.LOITER")
+    found_m = bench.pilot.state.position[0]
+    assert 6.0 < found_m < 6.6
+    furthest_m = 0.0
+    for _ in range(100):
+        furthest_m = max(furthest_m, bench.run(0.1).pilot.state.position[0])
+    assert furthest_m > found_m + 0.5
+    assert bench.pilot.state.position[0] == pytest.approx(found_m, abs=0.2)
