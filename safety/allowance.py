@@ -3,7 +3,8 @@
 Braking must always stay available, so nothing may be worse than braking. Beyond that:
 
 * a point, edge or vertex that braking keeps clear of by the full margin must be kept clear of by the full margin;
-* once braking comes inside a margin anywhere, other points may be neared to a quarter of it, so that a vehicle can slide along;
+* once braking comes inside a margin anywhere, the fence's included, other points may be neared to a quarter of theirs, so that a
+  vehicle can slide along;
 * a vehicle under a zero command still drifts by the error of its velocity estimate. Where it stands, or will after braking, a
   little inside a margin, a command must therefore lead out again: slowly, and only so far in that drift explains it;
 * where braking itself would bring the hull onto a point, no command may have any part towards it.
@@ -96,8 +97,8 @@ def allowance(
     `position_m` [2]: the vehicle now; `ways`: out of the fence's margins, where braking comes into any.
     """
     slide = -SLIDE_SHARE * config.margin_m
-    worst = float(clear_m.min()) if clear_m.shape[0] else 0.0
-    normals, due = _outward(tube, clear_m, points_m, position_m, config)
+    worst = min(float(clear_m.min(initial=0.0)), float(fence_m[:-2].min(initial=0.0)))
+    normals, due = _outward(tube, clear_m, points_m, position_m, ways is not None, config)
     if ways is not None:
         normals, due = np.concatenate((normals, ways.normals), axis=1), np.concatenate((due, _fence_due_m_s(ways, config)))
     push: Floats = np.zeros(2)
@@ -109,7 +110,7 @@ def allowance(
     gain_s = stop_gain_s(config)
     sink, climb = (_vertical_bound(room_m, gain_s, config) for room_m in fence_m[-2:].tolist())
     return Allowance(
-        clearance_m=np.minimum(clear_m, max(min(0.0, worst), slide)),
+        clearance_m=np.minimum(clear_m, max(worst, slide)),
         fence_m=np.minimum(0.0, fence_m),
         normals=normals,
         outward_m_s=due,
@@ -125,10 +126,13 @@ def _as_pushed(due_m_s: Floats, normals: Floats, push_m_s: Floats) -> Floats:
     return np.where(due_m_s > 0.0, np.minimum(due_m_s, push_m_s @ normals), due_m_s)
 
 
-def _outward(tube: Tubes, clear_m: Floats, points_m: Floats, position_m: Floats, config: SafetyConfig) -> tuple[Floats, Floats]:
+def _outward(
+    tube: Tubes, clear_m: Floats, points_m: Floats, position_m: Floats, pressed: bool, config: SafetyConfig
+) -> tuple[Floats, Floats]:
     """Directions [2, h] away from the points that braking comes near to, and the speed due along each [h].
 
-    Positive: it comes too near; zero: onto the point; negative: there is room, but the way out of another may not use up more.
+    Positive: it comes too near; zero: onto the point; negative: there is room, but the way out of something else may not use up
+    more. `pressed`: that something may be the fence.
     """
     if clear_m.shape[0] == 0:
         return _NO_NORMALS, _NO_SPEEDS
@@ -136,7 +140,7 @@ def _outward(tube: Tubes, clear_m: Floats, points_m: Floats, position_m: Floats,
     here = points_m - position_m[:, None]
     depth_here = config.keep_out_m - slide - np.sqrt((here * here).sum(axis=0))
     depth = np.maximum(-clear_m - slide, depth_here)
-    if not (depth > 0.0).any():  # the usual case
+    if not pressed and not (depth > 0.0).any():  # the usual case
         return _NO_NORMALS, _NO_SPEEDS
     near = depth > -NEAR_M
     near_now, depth, points = (depth_here >= depth)[near], depth[near], points_m[:, near]
@@ -147,7 +151,9 @@ def _outward(tube: Tubes, clear_m: Floats, points_m: Floats, position_m: Floats,
     away = np.where(from_here, position_m[:, None], begin + share * leg) - points
     away /= np.maximum(np.sqrt((away * away).sum(axis=0)), _LEAST_M)
     due = np.where(depth <= config.margin_m + POINT_BAND_M, _hold_off_m_s(depth, config), 0.0)
-    return away, np.where(depth > 0.0, due, depth / stop_gain_s(config))
+    # towards a point the error of the velocity counts over the whole lag, however slow: what room is left beyond that may be used
+    spare = np.minimum(depth + config.velocity_error_m_s * config.lag_s, 0.0)
+    return away, np.where(depth > 0.0, due, spare / stop_gain_s(config))
 
 
 def _way_out_m_s(normals: Floats, due_m_s: Floats, config: SafetyConfig) -> Floats:

@@ -63,7 +63,7 @@ def test_too_near_one_piece_of_the_fence_the_others_keep_their_room():
 @pytest.mark.parametrize("seed", range(120))
 def test_directions_and_speeds_due_are_those_of_the_slow_way(seed):
     position, tube, points, clear, fence, _ = scene(seed)
-    normals, speeds = _outward(tube, clear, points, position, C)
+    normals, speeds = _outward(tube, clear, points, position, False, C)
     depths = [max(-c - SLIDE, KEEP_OUT - SLIDE - math.dist(p, position)) for p, c in zip(points.T, clear, strict=True)]
     wanted = []
     for p, c, depth in zip(points.T, clear, depths, strict=True):
@@ -73,12 +73,12 @@ def test_directions_and_speeds_due_are_those_of_the_slow_way(seed):
         place = position if near_now or depth > MARGIN else to_leg(p, tube.turn_m[0, -1, :2], tube.stop_m[0, -1, :2])[0]
         away = (place - p) / max(math.dist(place, p), 1e-6)
         due = hold_off(depth) if depth <= MARGIN + POINT_BAND else 0.0
-        wanted.append((*away, due if depth > 0.0 else depth / GAIN))
+        wanted.append((*away, due if depth > 0.0 else min(depth + 0.05 * 0.6, 0.0) / GAIN))
     assert speeds.shape == (len(wanted),)
     for at, (x, y, speed) in enumerate(wanted):
         assert (normals[0, at], normals[1, at], speeds[at]) == pytest.approx((x, y, speed), abs=1e-9)
     found = allowance(tube, clear, fence, points, position, None, C)
-    worst = min([0.0, *clear])
+    worst = min([0.0, *clear, *fence[:-2]])
     assert found.clearance_m == pytest.approx(np.array([min(c, max(worst, -SLIDE)) for c in clear]))
     assert found.fence_m == pytest.approx(np.minimum(fence, 0.0))
     assert (found.brake_stop_m == tube.stop_m[:, -1]).all()
@@ -119,7 +119,7 @@ def test_ways_out_of_the_fence_are_added(seed):
     position, tube, points, clear, fence, chance = scene(seed)
     out = ways(chance, 4)
     assert _fence_due_m_s(out, C) == pytest.approx([fence_due(room) for room in out.room_m])
-    normals, speeds = _outward(tube, clear, points, position, C)
+    normals, speeds = _outward(tube, clear, points, position, True, C)
     normals = np.concatenate((normals, out.normals), axis=1)
     speeds = np.concatenate((speeds, [fence_due(room) for room in out.room_m]))
     found = allowance(tube, clear, fence, points, position, out, C)
