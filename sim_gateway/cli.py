@@ -12,13 +12,14 @@ import sys
 import threading
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
     from sim_gateway.faults import Fault
     from sim_gateway.gateway import GatewayConfig
+    from sim_gateway.px4_gateway import Px4Config
     from sim_gateway.scene import World
 
 _EPILOG = """
@@ -38,9 +39,14 @@ sim-gateway --world configs/worlds/corridor.yaml --vehicles 3
 
 sim-gateway --world configs/worlds/corridor.yaml --serial-lidar ld06 --serial-link /tmp/lidar
 
+sim-gateway --world configs/worlds/corridor.yaml --px4
+
+sim-gateway --world configs/worlds/corridor.yaml --px4 serial:/dev/ttyACM0,921600
+
 Then connect a MAVSDK client to udpin://127.0.0.1:14540 and a Hokuyo SCIP driver to 127.0.0.1:10940.
 """
 _MOST_VEHICLES = 40  # then the onboard ports would meet the gateway's own
+_PX4_DEFAULT = "tcp:4560"
 _HIGHEST_PORT = 65535 - 4020 - _MOST_VEHICLES  # the gateway's own ports lie up to this far above the client's
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich")
@@ -105,7 +111,17 @@ def serve(
     ] = None,
     faults: Annotated[Path | None, typer.Option(help="Scenario file (YAML) of faults.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write the true path, contacts and events here (JSON).")] = None,
-    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Vehicle seconds per second.")] = 1.0,
+    px4: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[tcp:PORT|serial:DEVICE,BAUD]",
+            help="Be the simulator of a real PX4 (SITL: airframe 10016 none_iris; serial: HITL) instead. Alone: tcp:4560.",
+        ),
+    ] = None,
+    no_gps: Annotated[bool, typer.Option("--no-gps", help="With --px4: vision odometry instead of GPS.")] = False,
+    speed: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="Vehicle seconds per second; 0, with --px4: as fast as PX4 answers.")
+    ] = 1.0,
     max_time: Annotated[float, typer.Option(min=0.0, help="Stop after this many vehicle seconds; 0: never.")] = 0.0,
     quit_with_parent: Annotated[
         bool, typer.Option("--quit-with-parent", help="Stop when stdin closes or the parent dies.")
@@ -118,26 +134,63 @@ def serve(
     """
     _log_to_stderr(verbose)
     scene = _load(world, seed, start, goal)
+    common: dict[str, Any] = {
+        "seed": scene.seed,
+        "lidar_port": lidar_port,
+        "wind_m_s": _triple("--wind", wind),
+        "heading_rad": math.radians(_finite("--heading", heading)),
+        "speed": speed,
+        "max_time_s": max_time or math.inf,
+        "report": report,
+        "serial_lidar": serial_lidar.value if serial_lidar is not None else None,
+        "serial_link": serial_link,
+        "faults": _faults(fault or [], faults),
+    }
+    if px4 is not None:
+        from sim_gateway.px4_gateway import Px4Config
+
+        _serve_px4(scene, Px4Config(address=px4, gps=not no_gps, **common), quit_with_parent)
+        return
+    if speed == 0.0 or no_gps:
+        raise _UsageError(f"{'--no-gps' if no_gps else '--speed 0'} goes only with --px4")
     from sim_gateway.gateway import GatewayConfig
 
-    config = GatewayConfig(
-        seed=scene.seed,
-        onboard_port=onboard_port,
-        gcs_port=gcs_port,
-        lidar_port=lidar_port,
-        dynamics=dynamics.value,
-        vehicle=vehicle.value,
-        estimate=estimate.value,
-        wind_m_s=_triple("--wind", wind),
-        heading_rad=math.radians(_finite("--heading", heading)),
-        speed=speed,
-        max_time_s=max_time or math.inf,
-        report=report,
-        serial_lidar=serial_lidar.value if serial_lidar is not None else None,
-        serial_link=serial_link,
-        faults=_faults(fault or [], faults),
-    )
+    vehicle_facts = {"dynamics": dynamics.value, "vehicle": vehicle.value, "estimate": estimate.value}
+    config = GatewayConfig(onboard_port=onboard_port, gcs_port=gcs_port, **vehicle_facts, **common)
     _serve(scene, config, vehicles, quit_with_parent)
+
+
+def _stop_event(quit_with_parent: bool) -> threading.Event:
+    """What is set when somebody wants this program to end."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    if quit_with_parent:
+        _follow_parent(stop)
+    return stop
+
+
+def _serve_px4(world: World, config: Px4Config, quit_with_parent: bool) -> None:
+    from sim_gateway.px4_gateway import Px4Gateway, warm_up
+    from sim_gateway.px4_wire import Px4LineError
+    from sim_gateway.scip import ScipServerError
+
+    stop = _stop_event(quit_with_parent)
+    try:
+        warm_up(world)
+        gateway = Px4Gateway(world, config)
+    except Px4LineError as error:
+        raise _UsageError(f"{error}: choose another with --px4") from None
+    except ScipServerError as error:
+        raise _UsageError(f"{error} with --lidar-port") from None
+    except FileExistsError:
+        raise _UsageError(f"--serial-link {config.serial_link} exists and is not a link: choose another name") from None
+    with gateway:
+        ready = gateway.ready_message()
+        print(json.dumps(ready), flush=True)
+        log = logging.getLogger("sim_gateway")
+        log.info("world %s: PX4 on %s, LiDAR on TCP port %d; Ctrl-C stops", world.name, ready["px4"], ready["lidar_port"])
+        gateway.run(stop)
 
 
 def _serve(world: World, config: GatewayConfig, vehicles: int, quit_with_parent: bool) -> None:
@@ -147,11 +200,7 @@ def _serve(world: World, config: GatewayConfig, vehicles: int, quit_with_parent:
     from sim_gateway.mavlink_links import PortInUseError
     from sim_gateway.scip import ScipServerError
 
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    if quit_with_parent:
-        _follow_parent(stop)
+    stop = _stop_event(quit_with_parent)
     try:
         warm_up(world, config.dynamics)
         fleet = Fleet(world, config, vehicles)
@@ -265,13 +314,21 @@ def _log_to_stderr(verbose: bool) -> None:
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 
+def _completed(arguments: list[str]) -> list[str]:
+    """The arguments with the value that `--px4` alone stands for."""
+    given: list[str] = []
+    for argument, after in zip(arguments, [*arguments[1:], "--"], strict=True):
+        given += [argument, _PX4_DEFAULT] if argument == "--px4" and after.startswith("-") else [argument]
+    return given
+
+
 def main() -> None:
     """Entry point: a user's mistake is one line on stderr and exit code 2; a vehicle that diverged, exit code 1."""
     from sim_gateway.errors import DivergedError
     from strict_yaml import ConfigError
 
     try:
-        code = app(standalone_mode=False)
+        code = app(_completed(sys.argv[1:]), standalone_mode=False)
     except DivergedError as error:
         print(f"sim-gateway: {error}", file=sys.stderr)
         code = 1
