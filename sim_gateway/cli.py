@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
-import os
-import signal
-import stat
 import sys
-import threading
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sim_gateway.errors import UsageError
+
 if TYPE_CHECKING:
     from sim_gateway.faults import Fault
-    from sim_gateway.gateway import GatewayConfig
-    from sim_gateway.px4_gateway import Px4Config
+    from sim_gateway.link_spec import LinkSpec
     from sim_gateway.scene import World
 
 _EPILOG = """
@@ -38,6 +34,8 @@ sim-gateway --world configs/worlds/corridor.yaml --dynamics jsbsim --vehicle sih
 sim-gateway --world configs/worlds/corridor.yaml --vehicles 3
 
 sim-gateway --world configs/worlds/corridor.yaml --serial-lidar ld06 --serial-link /tmp/lidar
+
+sim-gateway --world configs/worlds/corridor.yaml --link udp:14540,delay_ms=50,loss=0.02 --link pty:/tmp/mavlink,baud=57600
 
 sim-gateway --world configs/worlds/corridor.yaml --px4
 
@@ -82,10 +80,6 @@ class SerialKind(StrEnum):
     rplidar = "rplidar"
 
 
-class _UsageError(Exception):
-    """A mistake of the user's; one line that says what to change."""
-
-
 @app.command(epilog=_EPILOG)
 def serve(
     world: Annotated[Path, typer.Option(help="World file (YAML), see configs/worlds/.")],
@@ -103,6 +97,14 @@ def serve(
     onboard_port: Annotated[int, typer.Option(min=1, max=_HIGHEST_PORT, help="UDP port of the onboard client.")] = 14540,
     gcs_port: Annotated[int, typer.Option(min=0, max=_HIGHEST_PORT, help="UDP port of the ground station; 0: none.")] = 14550,
     lidar_port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the LiDAR; 0: any free one.")] = 10940,
+    link: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND:PLACE,NAME=VALUE",
+            help="A MAVLink link (udp, tcp, serial, pty), or how good the one on that UDP port is, such as "
+            "udp:14540,delay_ms=50,jitter_ms=10,loss=0.02,dup=0.01 or pty:/tmp/mavlink,baud=57600; repeatable.",
+        ),
+    ] = None,
     serial_lidar: Annotated[SerialKind | None, typer.Option(help="Also a spinning LiDAR on a pseudo-terminal.")] = None,
     serial_link: Annotated[Path | None, typer.Option(help="Symbolic link to that pseudo-terminal.")] = None,
     fault: Annotated[
@@ -148,109 +150,19 @@ def serve(
     }
     if px4 is not None:
         from sim_gateway.px4_gateway import Px4Config
+        from sim_gateway.serve import serve_px4
 
-        _serve_px4(scene, Px4Config(address=px4, gps=not no_gps, **common), quit_with_parent)
+        serve_px4(scene, Px4Config(address=px4, gps=not no_gps, **common), quit_with_parent)
         return
     if speed == 0.0 or no_gps:
-        raise _UsageError(f"{'--no-gps' if no_gps else '--speed 0'} goes only with --px4")
+        raise UsageError(f"{'--no-gps' if no_gps else '--speed 0'} goes only with --px4")
     from sim_gateway.gateway import GatewayConfig
+    from sim_gateway.serve import serve_fleet
 
     vehicle_facts = {"dynamics": dynamics.value, "vehicle": vehicle.value, "estimate": estimate.value}
-    config = GatewayConfig(onboard_port=onboard_port, gcs_port=gcs_port, **vehicle_facts, **common)
-    _serve(scene, config, vehicles, quit_with_parent)
-
-
-def _stop_event(quit_with_parent: bool) -> threading.Event:
-    """What is set when somebody wants this program to end."""
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    if quit_with_parent:
-        _follow_parent(stop)
-    return stop
-
-
-def _serve_px4(world: World, config: Px4Config, quit_with_parent: bool) -> None:
-    from sim_gateway.px4_gateway import Px4Gateway, warm_up
-    from sim_gateway.px4_wire import Px4LineError
-    from sim_gateway.scip import ScipServerError
-
-    stop = _stop_event(quit_with_parent)
-    try:
-        warm_up(world)
-        gateway = Px4Gateway(world, config)
-    except Px4LineError as error:
-        raise _UsageError(f"{error}: choose another with --px4") from None
-    except ScipServerError as error:
-        raise _UsageError(f"{error} with --lidar-port") from None
-    except FileExistsError:
-        raise _UsageError(f"--serial-link {config.serial_link} exists and is not a link: choose another name") from None
-    with gateway:
-        ready = gateway.ready_message()
-        print(json.dumps(ready), flush=True)
-        log = logging.getLogger("sim_gateway")
-        log.info("world %s: PX4 on %s, LiDAR on TCP port %d; Ctrl-C stops", world.name, ready["px4"], ready["lidar_port"])
-        gateway.run(stop)
-
-
-def _serve(world: World, config: GatewayConfig, vehicles: int, quit_with_parent: bool) -> None:
-    from sim_gateway.errors import DynamicsMissingError
-    from sim_gateway.fleet import Fleet, NoRoomError
-    from sim_gateway.gateway import warm_up
-    from sim_gateway.mavlink_links import PortInUseError
-    from sim_gateway.scip import ScipServerError
-
-    stop = _stop_event(quit_with_parent)
-    try:
-        warm_up(world, config.dynamics)
-        fleet = Fleet(world, config, vehicles)
-    except DynamicsMissingError as error:
-        raise _UsageError(str(error)) from None
-    except NoRoomError as error:
-        raise _UsageError(f"{error}: fewer --vehicles, or another --start") from None
-    except PortInUseError as error:
-        raise _UsageError(f"{error}: stop the program there, or choose another with --onboard-port or --gcs-port") from None
-    except ScipServerError as error:
-        raise _UsageError(f"{error} with --lidar-port") from None
-    except FileExistsError:
-        raise _UsageError(f"--serial-link {config.serial_link} exists and is not a link: choose another name") from None
-    with fleet:
-        print(json.dumps(fleet.ready_message()), flush=True)
-        for gateway in fleet.gateways:
-            logging.getLogger("sim_gateway").info(
-                "world %s, vehicle %d: MAVLink to udpin://127.0.0.1:%d, LiDAR on TCP port %d; Ctrl-C stops",
-                *(world.name, gateway.config.system_id, gateway.config.onboard_port, gateway.lidar.port),
-            )
-        fleet.run(stop)
-
-
-def _follow_parent(stop: threading.Event) -> None:
-    """Set `stop` when stdin, if it is a pipe, ends or this process gets another parent.
-
-    Not by Linux's parent-death signal: that one comes already when the thread that started this process ends.
-    """
-    parent = os.getppid()
-
-    def read_to_end() -> None:
-        while os.read(sys.stdin.fileno(), 4096):  # not sys.stdin.buffer: a thread inside its lock aborts the interpreter at exit
-            pass
-        stop.set()
-
-    def watch_parent() -> None:
-        while not stop.wait(0.5):
-            if os.getppid() != parent:
-                stop.set()
-
-    for watcher in (read_to_end, watch_parent) if _stdin_is_pipe() else (watch_parent,):
-        threading.Thread(target=watcher, daemon=True).start()
-
-
-def _stdin_is_pipe() -> bool:
-    try:
-        mode = os.fstat(0).st_mode
-    except OSError:  # no stdin at all
-        return False
-    return stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode)
+    links = _links(link or [])
+    config = GatewayConfig(onboard_port=onboard_port, gcs_port=gcs_port, links=links, **vehicle_facts, **common)
+    serve_fleet(scene, config, vehicles, quit_with_parent)
 
 
 def _load(path: Path, seed: int | None, start: str | None, goal: str | None) -> World:
@@ -270,7 +182,7 @@ def _load(path: Path, seed: int | None, start: str | None, goal: str | None) -> 
         world = replace(world, goal=_triple("--goal", goal))
     for name, point in (("start", world.start), ("goal", world.goal)):
         if clearance_m(world.boxes_at(0.0), np.array(point), 0.0) <= 0.0:
-            raise _UsageError(f"--{name} {point} lies inside an obstacle: choose another place")
+            raise UsageError(f"--{name} {point} lies inside an obstacle: choose another place")
     return world
 
 
@@ -280,7 +192,16 @@ def _faults(texts: list[str], file: Path | None) -> tuple[Fault, ...]:
     try:
         return (*(load_faults(file) if file is not None else ()), *(Fault.parse(text) for text in texts))
     except FaultError as error:
-        raise _UsageError(str(error)) from None
+        raise UsageError(str(error)) from None
+
+
+def _links(texts: list[str]) -> tuple[LinkSpec, ...]:
+    from sim_gateway.link_spec import LinkSpec, LinkSpecError
+
+    try:
+        return tuple(LinkSpec.parse(text) for text in texts)
+    except LinkSpecError as error:
+        raise UsageError(str(error)) from None
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:
@@ -289,7 +210,7 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count or not all(math.isfinite(value) for value in values):
-        raise _UsageError(f"{option} {text!r}: give {count} finite numbers separated by commas, without spaces")
+        raise UsageError(f"{option} {text!r}: give {count} finite numbers separated by commas, without spaces")
     return values
 
 
@@ -300,7 +221,7 @@ def _triple(option: str, text: str) -> tuple[float, float, float]:
 
 def _finite(option: str, value: float) -> float:
     if not math.isfinite(value):
-        raise _UsageError(f"{option} {value}: give a finite number")
+        raise UsageError(f"{option} {value}: give a finite number")
     return value
 
 
@@ -332,7 +253,7 @@ def main() -> None:
     except DivergedError as error:
         print(f"sim-gateway: {error}", file=sys.stderr)
         code = 1
-    except (_UsageError, ConfigError) as error:
+    except (UsageError, ConfigError) as error:
         print(f"sim-gateway: {error}", file=sys.stderr)
         code = 2
     except Exception as error:

@@ -25,8 +25,9 @@ from sim_gateway.incidents import Incidents
 from sim_gateway.lidar import LidarConfig
 from sim_gateway.lidar_devices import LidarDevices
 from sim_gateway.link_faults import LinkFaults
-from sim_gateway.mavlink_links import UdpLink
+from sim_gateway.link_spec import LinkSpec
 from sim_gateway.mavlink_server import MavlinkServer
+from sim_gateway.open_links import link_plan, open_links, ready_links
 from sim_gateway.pace import Pace
 from sim_gateway.piloted import PilotedVehicle
 from sim_gateway.report_faults import ReportFaults
@@ -37,8 +38,6 @@ from sim_gateway.telemetry import Telemetry
 from sim_gateway.vehicle import STEP_S
 from sim_gateway.vehicle_params import PROFILES
 
-# distance from the port a client listens on to the gateway's own port, as in PX4's SITL (14580 - 14540, 18570 - 14550)
-ONBOARD_PORT_OFFSET, GROUND_PORT_OFFSET = 40, 4020
 _TELL_EVERY_S = 0.2
 _MAX_STEPS_PER_TURN = 25
 _LONGEST_WAIT_S = 0.02
@@ -49,6 +48,8 @@ _log = logging.getLogger("sim_gateway")
 @dataclass(frozen=True, slots=True)
 class GatewayConfig:
     """How to run. Ports are those the clients use; `gcs_port` 0 leaves that link out, `lidar_port` 0 takes a free one.
+
+    `links`: further links, or the quality of these two (a UDP link to the same port).
 
     `dynamics`: a name of `dynamics.DYNAMICS`, `vehicle` one of `vehicle_params.PROFILES`. `system_id`: 1 to 250; as with PX4's
     instances, the own ground station port lies that many less one further up. `serial_lidar`: also a spinning LiDAR of this kind
@@ -71,6 +72,7 @@ class GatewayConfig:
     serial_lidar: str | None = None
     serial_link: Path | None = None
     faults: tuple[Fault, ...] = ()
+    links: tuple[LinkSpec, ...] = ()
 
 
 def connect_faults(vehicle: PilotedVehicle, server: MavlinkServer, telemetry: Telemetry, seed: int) -> Incidents:
@@ -111,9 +113,8 @@ class Gateway:
         pilot, frame = self.vehicle.autopilot, self.vehicle.frame
         self.recorder = FlightRecorder(self.vehicle.simulation, self._facts())
         self.telemetry = Telemetry(pilot, frame, self.vehicle.snapshot, lambda: self.vehicle.time_s, config.system_id)
-        onboard = (config.onboard_port + ONBOARD_PORT_OFFSET, config.onboard_port)
-        ground = (config.gcs_port + GROUND_PORT_OFFSET + config.system_id - 1, config.gcs_port) if config.gcs_port else None
-        self.server = MavlinkServer(pilot, frame, self.telemetry, onboard, ground)
+        links = open_links(link_plan(config.onboard_port, config.gcs_port, config.links), self.telemetry.now_s, config)
+        self.server = MavlinkServer(pilot, frame, self.telemetry, links=links)
         self.incidents = connect_faults(self.vehicle, self.server, self.telemetry, config.seed)
         for fault in config.faults:
             self.vehicle.simulation.inject(fault)
@@ -151,6 +152,7 @@ class Gateway:
             "system_id": config.system_id,
             "onboard_port": config.onboard_port,
             "gcs_port": config.gcs_port,
+            "links": ready_links(self.server.links),
             **self.lidars.ready_message(),
             "start": list(world.start),
             "start_yaw_rad": world.start_yaw_rad,
@@ -289,7 +291,7 @@ def _wait(gateways: Sequence[Gateway], seconds: float) -> None:
     """Sleep until the next step is due; what arrives meanwhile is handled at once."""
     if seconds <= 0.0:
         return
-    owners = {link.socket: gateway for gateway in gateways for link in gateway.server.links if isinstance(link, UdpLink)}
+    owners = {watched: gateway for gateway in gateways for link in gateway.server.links for watched in link.watched()}
     readable, _, _ = select.select(list(owners), [], [], min(seconds, _LONGEST_WAIT_S))
     for gateway in {owners[sock] for sock in readable}:
         gateway.server.poll()

@@ -299,4 +299,4 @@ def test_a_line_too_slow_for_the_sensors_loses_messages_not_time() -> None:
         assert arrived * 70 < 2.2 * 5760, "no more than the line carries"
         assert arrived > 50
         assert gateway.line.lost_messages > 250
-        assert seen[-1].time_usec * 1e-6 > gateway.simulation.time_s - 0.1, "and it is fresh"
+        assert seen[-1].time_usec * 1e-6 > gateway.simulation.time_s - 0.5, "and it is fresh"
