@@ -41,6 +41,8 @@ sim-gateway --world configs/worlds/corridor.yaml --px4
 
 sim-gateway --world configs/worlds/corridor.yaml --px4 serial:/dev/ttyACM0,921600
 
+sim-gateway --world configs/worlds/corridor.yaml --follow udpin://127.0.0.1:14551 --heading 90
+
 Then connect a MAVSDK client to udpin://127.0.0.1:14540 and a Hokuyo SCIP driver to 127.0.0.1:10940.
 """
 _MOST_VEHICLES = 40  # then the onboard ports would meet the gateway's own
@@ -120,6 +122,24 @@ def serve(
             help="Be the simulator of a real PX4 (SITL: airframe 10016 none_iris; serial: HITL) instead. Alone: tcp:4560.",
         ),
     ] = None,
+    follow: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            help="Serve the LiDAR of a vehicle that is elsewhere and reports its pose here instead: udpin://127.0.0.1:14551, "
+            "udpout://, tcp:// or serial://DEVICE:BAUD.",
+        ),
+    ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="With --follow: its local origin in the corridor, m; default: start."),
+    ] = None,
+    pose_timeout: Annotated[
+        float, typer.Option(min=0.01, max=10.0, help="With --follow: a pose older than this, s, stops the scans.")
+    ] = 0.3,
+    pose_latency: Annotated[
+        float, typer.Option(min=-1.0, max=1.0, help="With --follow: s by which a pose is older than its stamp tells.")
+    ] = 0.0,
     no_gps: Annotated[bool, typer.Option("--no-gps", help="With --px4: vision odometry instead of GPS.")] = False,
     speed: Annotated[
         float, typer.Option(min=0.0, max=100.0, help="Vehicle seconds per second; 0, with --px4: as fast as PX4 answers.")
@@ -156,6 +176,17 @@ def serve(
         return
     if speed == 0.0 or no_gps:
         raise UsageError(f"{'--no-gps' if no_gps else '--speed 0'} goes only with --px4")
+    if follow is not None:
+        from sim_gateway.follow_gateway import FollowConfig
+        from sim_gateway.serve import serve_follow
+
+        if speed != 1.0:
+            raise UsageError("--speed: a vehicle that is elsewhere has its own time; leave it out")
+        place = _triple("--origin", origin) if origin is not None else None
+        times = {"timeout_s": pose_timeout, "latency_s": pose_latency}
+        del common["speed"], common["wind_m_s"]
+        serve_follow(scene, FollowConfig(url=follow, origin_m=place, **times, **common), quit_with_parent)
+        return
     from sim_gateway.gateway import GatewayConfig
     from sim_gateway.serve import serve_fleet
 

@@ -18,6 +18,7 @@ from sim_gateway.local_frame import LocalFrame
 from sim_gateway.mavlink_frame import FramePacker, Message
 from sim_gateway.motor_dynamics import MotorDynamics
 from sim_gateway.simulation import Simulation
+from sim_gateway.telemetry import rotate_to_body
 from sim_gateway.vehicle import ACC, OMEGA, POS, QUAT, STEP_S, VEL, rotation_into
 from sim_gateway.vehicle_params import GRAVITY_M_S2
 
@@ -172,7 +173,8 @@ class HilSensors:
         noise, draw = self._noise, self._draw
         place = [value + noise.vision_m * draw() for value in reading[_PLACE:_SPEED]]
         turn = _disturbed(reading[_TURN:_CHANGE], [noise.vision_rad * draw() for _ in range(3)])
-        speed = [v + noise.vision_speed_m_s * draw() for v in _to_body(reading[_TURN:_CHANGE], reading[_SPEED:_TURN])]
+        attitude, velocity = reading[_TURN:_CHANGE], reading[_SPEED:_TURN]
+        speed = [v + noise.vision_speed_m_s * draw() for v in rotate_to_body(tuple(attitude), tuple(velocity))]
         return mav.MAVLink_odometry_message(
             *(time_us, mav.MAV_FRAME_LOCAL_NED, _BODY_FRD, *place, turn, *speed, *reading[_RATE:_FIELD]),
             *(_covariance(noise.vision_m, noise.vision_rad), _covariance(noise.vision_speed_m_s, noise.vision_rad)),
@@ -193,17 +195,6 @@ def _covariance(linear: float, angular: float) -> list[float]:
     for index in (15, 18, 20):
         values[index] = angular * angular
     return values
-
-
-def _to_body(turn: list[float], ned: list[float]) -> list[float]:
-    """A NED vector in FRD axes, by the quaternion FRD -> NED."""
-    w, x, y, z = turn
-    north, east, down = ned
-    return [
-        (1 - 2 * (y * y + z * z)) * north + 2 * (x * y + w * z) * east + 2 * (x * z - w * y) * down,
-        2 * (x * y - w * z) * north + (1 - 2 * (x * x + z * z)) * east + 2 * (y * z + w * x) * down,
-        2 * (x * z + w * y) * north + 2 * (y * z - w * x) * east + (1 - 2 * (x * x + y * y)) * down,
-    ]
 
 
 def _disturbed(turn: list[float], angles: list[float]) -> list[float]:

@@ -15,9 +15,12 @@ from typing import Any
 
 from sim_gateway.errors import DynamicsMissingError, UsageError
 from sim_gateway.fleet import Fleet, NoRoomError
+from sim_gateway.follow_gateway import FollowConfig, FollowGateway
+from sim_gateway.follow_gateway import warm_up as warm_up_follow
 from sim_gateway.gateway import GatewayConfig, warm_up
 from sim_gateway.link_spec import LinkSpecError
 from sim_gateway.mavlink_links import PortInUseError
+from sim_gateway.pose_source import FollowUrlError
 from sim_gateway.px4_gateway import Px4Config, Px4Gateway
 from sim_gateway.px4_gateway import warm_up as warm_up_px4
 from sim_gateway.px4_wire import Px4LineError
@@ -39,6 +42,8 @@ def _usage_errors() -> Iterator[None]:
         raise UsageError(f"{error}: fewer --vehicles, or another --start") from None
     except PortInUseError as error:
         raise UsageError(f"{error}: stop the program there, or choose another: --onboard-port, --gcs-port, --link") from None
+    except FollowUrlError as error:
+        raise UsageError(f"--follow {error}") from None
     except Px4LineError as error:
         raise UsageError(f"{error}: choose another with --px4") from None
     except ScipServerError as error:
@@ -73,6 +78,19 @@ def serve_px4(world: World, config: Px4Config, quit_with_parent: bool) -> None:
         ready = gateway.ready_message()
         _say_ready(ready)
         _log.info("world %s: PX4 on %s, LiDAR on TCP port %d; Ctrl-C stops", world.name, ready["px4"], ready["lidar_port"])
+        gateway.run(stop)
+
+
+def serve_follow(world: World, config: FollowConfig, quit_with_parent: bool) -> None:
+    """Serve LiDARs to a vehicle that is elsewhere."""
+    stop = _stop_event(quit_with_parent)
+    with _usage_errors():
+        warm_up_follow(world)
+        gateway = FollowGateway(world, config)
+    with gateway:
+        ready = gateway.ready_message()
+        _say_ready(ready)
+        _log.info("world %s: following %s, LiDAR on TCP port %d; Ctrl-C stops", world.name, config.url, ready["lidar_port"])
         gateway.run(stop)
 
 

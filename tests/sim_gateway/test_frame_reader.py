@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v10 import common as mav1
 from pymavlink.dialects.v20 import development as mav
@@ -20,6 +20,7 @@ def _packed(*messages: mav.MAVLink_message) -> bytes:
     return b"".join(message.pack(mav.MAVLink(None, srcSystem=7, srcComponent=9)) for message in messages)
 
 
+@settings(deadline=None)
 @given(st.lists(st.integers(1, 40), max_size=20))
 def test_frames_come_whole_from_pieces_of_any_size(cuts: list[int]) -> None:
     data, reader, found = _packed(*MESSAGES), FrameReader(), []
@@ -29,9 +30,10 @@ def test_frames_come_whole_from_pieces_of_any_size(cuts: list[int]) -> None:
     found += reader.feed(data)
     assert [frame.number for frame in found] == [0, 93, 30]
     assert {(frame.system, frame.component) for frame in found} == {(7, 9)}
-    assert decode(found[2]).yaw == MESSAGES[2].yaw or abs(decode(found[2]).yaw - 0.3) < 1e-6
+    assert abs(decode(found[2]).yaw - 0.3) < 1e-6
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=300), st.binary(max_size=600))
 def test_garbage_before_and_between_loses_no_frame_for_good(before: bytes, between: bytes) -> None:
     """A start byte in the garbage may hide what follows, but not for longer than the longest frame."""

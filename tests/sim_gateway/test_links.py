@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as mav
 
@@ -161,6 +161,7 @@ def test_loss_and_duplicates_in_their_share_and_the_same_for_a_seed() -> None:
     assert left != _through(LinkQuality(loss=0.1, duplicate=0.05), 2)
 
 
+@settings(deadline=None)
 @given(st.floats(0.0, 0.2), st.floats(0.0, 0.1), st.booleans())
 def test_delay_and_jitter_stay_within_their_bounds(delay_s: float, jitter_s: float, in_order: bool) -> None:
     left = _through(LinkQuality(delay_s, jitter_s), 3, in_order=in_order)
@@ -329,6 +330,7 @@ def test_a_serial_device_that_is_not_there_opens_nothing() -> None:
     open_links([LinkSpec.parse(f"tcp:{port}")], lambda: 0.0, GatewayConfig())[0].close()
 
 
+@settings(deadline=None)
 @given(st.lists(st.integers(1, 280), min_size=1, max_size=60), st.sampled_from([9600, 57600, 921600]))
 def test_paced_messages_are_whole_in_order_and_never_early(sizes: list[int], baud: int) -> None:
     taken: list[bytes] = []
