@@ -266,7 +266,7 @@ def _log_to_stderr(verbose: bool) -> None:
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 
-def _completed(arguments: list[str]) -> list[str]:
+def completed(arguments: list[str]) -> list[str]:
     """The arguments with the value that `--px4` alone stands for."""
     given: list[str] = []
     for argument, after in zip(arguments, [*arguments[1:], "--"], strict=True):
@@ -280,7 +280,7 @@ def main() -> None:
     from strict_yaml import ConfigError
 
     try:
-        code = app(_completed(sys.argv[1:]), standalone_mode=False)
+        code = app(completed(sys.argv[1:]), standalone_mode=False)
     except DivergedError as error:
         print(f"sim-gateway: {error}", file=sys.stderr)
         code = 1
