@@ -82,6 +82,44 @@ class SerialKind(StrEnum):
     rplidar = "rplidar"
 
 
+_Links = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="KIND:PLACE,NAME=VALUE",
+        help="A MAVLink link (udp, tcp, serial, pty), or how good the one on that UDP port is, such as "
+        "udp:14540,delay_ms=50,jitter_ms=10,loss=0.02,dup=0.01 or pty:/tmp/mavlink,baud=57600; repeatable.",
+    ),
+]
+_Px4 = Annotated[
+    str | None,
+    typer.Option(
+        metavar="[tcp:PORT|serial:DEVICE,BAUD]",
+        help="Be the simulator of a real PX4 (SITL: airframe 10016 none_iris; serial: HITL) instead. Alone: tcp:4560.",
+    ),
+]
+_NoGps = Annotated[bool, typer.Option("--no-gps", help="With --px4: vision odometry instead of GPS.")]
+_Follow = Annotated[
+    str | None,
+    typer.Option(
+        metavar="URL",
+        help="Serve the LiDAR of a vehicle that is elsewhere and reports its pose here instead: udpin://127.0.0.1:14551, "
+        "udpout://, tcp:// or serial://DEVICE:BAUD.",
+    ),
+]
+_Origin = Annotated[
+    str | None, typer.Option(metavar="X,Y,Z", help="With --follow: its local origin in the corridor, m; default: start.")
+]
+_PoseTimeout = Annotated[
+    float, typer.Option(min=0.01, max=10.0, help="With --follow: a pose older than this, s, stops the scans.")
+]
+_PoseLatency = Annotated[
+    float, typer.Option(min=-1.0, max=1.0, help="With --follow: s by which a pose is older than its stamp tells.")
+]
+_Speed = Annotated[
+    float, typer.Option(min=0.0, max=100.0, help="Vehicle seconds per second; 0, with --px4: as fast as PX4 answers.")
+]
+
+
 @app.command(epilog=_EPILOG)
 def serve(
     world: Annotated[Path, typer.Option(help="World file (YAML), see configs/worlds/.")],
@@ -99,14 +137,7 @@ def serve(
     onboard_port: Annotated[int, typer.Option(min=1, max=_HIGHEST_PORT, help="UDP port of the onboard client.")] = 14540,
     gcs_port: Annotated[int, typer.Option(min=0, max=_HIGHEST_PORT, help="UDP port of the ground station; 0: none.")] = 14550,
     lidar_port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the LiDAR; 0: any free one.")] = 10940,
-    link: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="KIND:PLACE,NAME=VALUE",
-            help="A MAVLink link (udp, tcp, serial, pty), or how good the one on that UDP port is, such as "
-            "udp:14540,delay_ms=50,jitter_ms=10,loss=0.02,dup=0.01 or pty:/tmp/mavlink,baud=57600; repeatable.",
-        ),
-    ] = None,
+    link: _Links = None,
     serial_lidar: Annotated[SerialKind | None, typer.Option(help="Also a spinning LiDAR on a pseudo-terminal.")] = None,
     serial_link: Annotated[Path | None, typer.Option(help="Symbolic link to that pseudo-terminal.")] = None,
     fault: Annotated[
@@ -115,35 +146,13 @@ def serve(
     ] = None,
     faults: Annotated[Path | None, typer.Option(help="Scenario file (YAML) of faults.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write the true path, contacts and events here (JSON).")] = None,
-    px4: Annotated[
-        str | None,
-        typer.Option(
-            metavar="[tcp:PORT|serial:DEVICE,BAUD]",
-            help="Be the simulator of a real PX4 (SITL: airframe 10016 none_iris; serial: HITL) instead. Alone: tcp:4560.",
-        ),
-    ] = None,
-    follow: Annotated[
-        str | None,
-        typer.Option(
-            metavar="URL",
-            help="Serve the LiDAR of a vehicle that is elsewhere and reports its pose here instead: udpin://127.0.0.1:14551, "
-            "udpout://, tcp:// or serial://DEVICE:BAUD.",
-        ),
-    ] = None,
-    origin: Annotated[
-        str | None,
-        typer.Option(metavar="X,Y,Z", help="With --follow: its local origin in the corridor, m; default: start."),
-    ] = None,
-    pose_timeout: Annotated[
-        float, typer.Option(min=0.01, max=10.0, help="With --follow: a pose older than this, s, stops the scans.")
-    ] = 0.3,
-    pose_latency: Annotated[
-        float, typer.Option(min=-1.0, max=1.0, help="With --follow: s by which a pose is older than its stamp tells.")
-    ] = 0.0,
-    no_gps: Annotated[bool, typer.Option("--no-gps", help="With --px4: vision odometry instead of GPS.")] = False,
-    speed: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Vehicle seconds per second; 0, with --px4: as fast as PX4 answers.")
-    ] = 1.0,
+    px4: _Px4 = None,
+    no_gps: _NoGps = False,
+    follow: _Follow = None,
+    origin: _Origin = None,
+    pose_timeout: _PoseTimeout = 0.3,
+    pose_latency: _PoseLatency = 0.0,
+    speed: _Speed = 1.0,
     max_time: Annotated[float, typer.Option(min=0.0, help="Stop after this many vehicle seconds; 0: never.")] = 0.0,
     quit_with_parent: Annotated[
         bool, typer.Option("--quit-with-parent", help="Stop when stdin closes or the parent dies.")
@@ -159,41 +168,49 @@ def serve(
     common: dict[str, Any] = {
         "seed": scene.seed,
         "lidar_port": lidar_port,
-        "wind_m_s": _triple("--wind", wind),
         "heading_rad": math.radians(_finite("--heading", heading)),
-        "speed": speed,
         "max_time_s": max_time or math.inf,
         "report": report,
         "serial_lidar": serial_lidar.value if serial_lidar is not None else None,
         "serial_link": serial_link,
         "faults": _faults(fault or [], faults),
     }
-    if px4 is not None:
-        from sim_gateway.px4_gateway import Px4Config
-        from sim_gateway.serve import serve_px4
-
-        serve_px4(scene, Px4Config(address=px4, gps=not no_gps, **common), quit_with_parent)
-        return
-    if speed == 0.0 or no_gps:
+    moving: dict[str, Any] = {"speed": speed, "wind_m_s": _triple("--wind", wind)}
+    if (speed == 0.0 or no_gps) and px4 is None:
         raise UsageError(f"{'--no-gps' if no_gps else '--speed 0'} goes only with --px4")
-    if follow is not None:
-        from sim_gateway.follow_gateway import FollowConfig
-        from sim_gateway.serve import serve_follow
-
+    if px4 is not None:
+        _be_simulator(scene, quit_with_parent, address=px4, gps=not no_gps, **common, **moving)
+    elif follow is not None:
         if speed != 1.0:
             raise UsageError("--speed: a vehicle that is elsewhere has its own time; leave it out")
         place = _triple("--origin", origin) if origin is not None else None
         times = {"timeout_s": pose_timeout, "latency_s": pose_latency}
-        del common["speed"], common["wind_m_s"]
-        serve_follow(scene, FollowConfig(url=follow, origin_m=place, **times, **common), quit_with_parent)
-        return
+        _follow_vehicle(scene, quit_with_parent, url=follow, origin_m=place, **times, **common)
+    else:
+        ports = {"onboard_port": onboard_port, "gcs_port": gcs_port, "links": _links(link or [])}
+        kinds = {"dynamics": dynamics.value, "vehicle": vehicle.value, "estimate": estimate.value}
+        _stand_in(scene, vehicles, quit_with_parent, **ports, **kinds, **common, **moving)
+
+
+def _stand_in(world: World, vehicles: int, quit_with_parent: bool, **settings: Any) -> None:
     from sim_gateway.gateway import GatewayConfig
     from sim_gateway.serve import serve_fleet
 
-    vehicle_facts = {"dynamics": dynamics.value, "vehicle": vehicle.value, "estimate": estimate.value}
-    links = _links(link or [])
-    config = GatewayConfig(onboard_port=onboard_port, gcs_port=gcs_port, links=links, **vehicle_facts, **common)
-    serve_fleet(scene, config, vehicles, quit_with_parent)
+    serve_fleet(world, GatewayConfig(**settings), vehicles, quit_with_parent)
+
+
+def _be_simulator(world: World, quit_with_parent: bool, **settings: Any) -> None:
+    from sim_gateway.px4_gateway import Px4Config
+    from sim_gateway.serve import serve_px4
+
+    serve_px4(world, Px4Config(**settings), quit_with_parent)
+
+
+def _follow_vehicle(world: World, quit_with_parent: bool, **settings: Any) -> None:
+    from sim_gateway.follow_gateway import FollowConfig
+    from sim_gateway.serve import serve_follow
+
+    serve_follow(world, FollowConfig(**settings), quit_with_parent)
 
 
 def _load(path: Path, seed: int | None, start: str | None, goal: str | None) -> World:

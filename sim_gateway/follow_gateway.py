@@ -83,11 +83,11 @@ class FollowedDynamics:
     def advance(self, course: Course, demand: Demand, normals: Array, first_step: int) -> None:
         """See `dynamics.Dynamics.advance`."""
         state = course.state
-        before = state[POS : POS + 3].copy()
+        x, y, z = state[POS : POS + 3].tolist()
         if self.pose is not None:
             self._put(state, self.pose)
         last = first_step + normals.shape[0] - 1
-        after_step(state, *before, last, course.boxes, course.fixed, course.movers, course.contact_radius_m, course.log)
+        after_step(state, x, y, z, last, course.boxes, course.fixed, course.movers, course.contact_radius_m, course.log)
 
     def _put(self, state: Array, pose: Pose) -> None:
         frame = self._frame

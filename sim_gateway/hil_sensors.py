@@ -173,8 +173,8 @@ class HilSensors:
         noise, draw = self._noise, self._draw
         place = [value + noise.vision_m * draw() for value in reading[_PLACE:_SPEED]]
         turn = _disturbed(reading[_TURN:_CHANGE], [noise.vision_rad * draw() for _ in range(3)])
-        attitude, velocity = reading[_TURN:_CHANGE], reading[_SPEED:_TURN]
-        speed = [v + noise.vision_speed_m_s * draw() for v in rotate_to_body(tuple(attitude), tuple(velocity))]
+        (w, x, y, z), (north, east, down) = reading[_TURN:_CHANGE], reading[_SPEED:_TURN]
+        speed = [v + noise.vision_speed_m_s * draw() for v in rotate_to_body((w, x, y, z), (north, east, down))]
         return mav.MAVLink_odometry_message(
             *(time_us, mav.MAV_FRAME_LOCAL_NED, _BODY_FRD, *place, turn, *speed, *reading[_RATE:_FIELD]),
             *(_covariance(noise.vision_m, noise.vision_rad), _covariance(noise.vision_speed_m_s, noise.vision_rad)),

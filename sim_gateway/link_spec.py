@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -92,7 +93,7 @@ def _serial(where: str) -> LinkSpec:
     return LinkSpec("serial", path=where)
 
 
-_PLACES = {
+_PLACES: dict[str, Callable[[str], LinkSpec]] = {
     "udp": lambda where: _network("udp", where),
     "tcp": lambda where: _network("tcp", where),
     "serial": _serial,

@@ -67,11 +67,11 @@ class VehicleClock:
 
 @dataclass(slots=True)
 class _Part:
-    """Position or attitude as last reported: vehicle's stamp, value, its rate of change."""
+    """Position or attitude as last reported: vehicle's stamp, value, its rate of change (m/s or rad/s)."""
 
     stamp_s: float = -math.inf
     value: tuple[float, ...] = ()
-    rate: Vector = (0.0, 0.0, 0.0)
+    rate: tuple[float, ...] = ()
 
 
 class PoseTracker:
@@ -137,8 +137,8 @@ class PoseTracker:
         x, y, z = self._place.value
         vx, vy, vz = self._place.rate
         position = (x + vx * place_age_s, y + vy * place_age_s, z + vz * place_age_s)
-        attitude = _turned(self._turn.value, self._turn.rate, turn_age_s)
-        return Pose(position, self._place.rate, attitude, self._turn.rate, age_s)
+        p, q, r = self._turn.rate
+        return Pose(position, (vx, vy, vz), _turned(self._turn.value, (p, q, r), turn_age_s), (p, q, r), age_s)
 
 
 def _place_of(kind: str, m: Any) -> tuple[float, ...] | None:
