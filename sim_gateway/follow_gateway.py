@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.dynamics import Course, Demand, after_step
-from sim_gateway.faults import Fault
+from sim_gateway.faults import KINDS, SCAN, Fault, only_possible
 from sim_gateway.flight_report import FlightRecorder, world_facts, write_report
 from sim_gateway.frame_reader import FrameReader, decode
 from sim_gateway.lidar import LidarConfig
@@ -42,6 +42,7 @@ _TIMESYNC_PERIOD_S = 0.2
 _GROUND_M = 0.15  # below this height a vehicle counts as standing
 _MAX_STEPS_PER_TURN = 25
 _LONGEST_WAIT_S = 0.02
+_FAULTS = tuple(name for name, kind in KINDS.items() if kind.group == SCAN)
 
 _log = logging.getLogger("sim_gateway.follow")
 
@@ -105,11 +106,13 @@ class FollowedDynamics:
 class FollowGateway:
     """LiDARs for one vehicle elsewhere. Use as a context manager; `run` returns when asked to stop.
 
-    For tests in process: `alter_scan` changes a scan before it is sent, or swallows it (None).
+    Raises `FollowUrlError`, `SerialPortError`, `ScipServerError`, and `FaultError` for faults that are not the LiDAR's. For tests
+    in process: `alter_scan` changes a scan before it is sent, or swallows it (None).
     """
 
     def __init__(self, world: World, config: FollowConfig) -> None:
         self.world, self.config = world, config
+        only_possible(config.faults, _FAULTS, ("start",), "--follow")
         self.frame = LocalFrame(config.origin_m or (*world.start[:2], 0.0), config.heading_rad)
         self.dynamics = FollowedDynamics(self.frame)
         self.simulation = Simulation(world, None, LidarConfig.device(), "none", None, config.seed, dynamics=self.dynamics)

@@ -10,19 +10,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import development as mav
 
+from sim_gateway.hil_reading import CHANGE, FIELD, FORCE, PLACE, RATE, READING, SPEED, TURN, read_truth
 from sim_gateway.local_frame import LocalFrame
 from sim_gateway.mavlink_frame import FramePacker, Message
 from sim_gateway.motor_dynamics import MotorDynamics
 from sim_gateway.simulation import Simulation
 from sim_gateway.telemetry import rotate_to_body
-from sim_gateway.vehicle import ACC, OMEGA, POS, QUAT, STEP_S, VEL, rotation_into
+from sim_gateway.vehicle import OMEGA, STEP_S
 from sim_gateway.vehicle_params import GRAVITY_M_S2
-
-Array = NDArray[np.float64]
 
 SYSTEM_ID, COMPONENT_ID = 1, 51
 FIELD_NED_GAUSS = (0.2107, 0.0130, 0.4320)  # at PX4's usual place
@@ -32,9 +29,6 @@ _VISION_PER_STEP = 30.0 * STEP_S
 _BODY_FRD = 12
 _SPEED_LIMIT_CM_S = 32767
 _BLOCK_STEPS = 500
-
-# entries of a reading, NED and FRD
-_FORCE, _RATE, _FIELD, _PLACE, _SPEED, _TURN, _CHANGE, _READING = 0, 3, 6, 9, 12, 15, 19, 22
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,29 +45,6 @@ class SensorNoise:
     vision_m: float = 0.02
     vision_rad: float = 0.01
     vision_speed_m_s: float = 0.01
-
-
-@njit(cache=True)
-def _read(state: Array, force: Array, rate: Array, field: Array, frame: Array, out: Array) -> None:
-    """The true values into `out` [_READING]; `frame`: origin, cosine and sine of the heading and of its half."""
-    turn = np.empty((3, 3))
-    rotation_into(state, turn)
-    cos, sin, half_cos, half_sin = frame[3], frame[4], frame[5], frame[6]
-    # the field in corridor axes, then in the body's
-    fx, fy, fz = cos * field[0] + sin * field[1], sin * field[0] - cos * field[1], -field[2]
-    for i in range(3):
-        sign = 1.0 if i == 0 else -1.0
-        out[_FORCE + i] = sign * force[i]
-        out[_RATE + i] = sign * rate[i]
-        out[_FIELD + i] = sign * (turn[0, i] * fx + turn[1, i] * fy + turn[2, i] * fz)
-    for start, source in ((_PLACE, POS), (_SPEED, VEL), (_CHANGE, ACC)):
-        x, y, z = state[source], state[source + 1], state[source + 2]
-        if source == POS:
-            x, y, z = x - frame[0], y - frame[1], z - frame[2]
-        out[start], out[start + 1], out[start + 2] = cos * x + sin * y, sin * x - cos * y, -z
-    w, x, y, z = state[QUAT], state[QUAT + 1], -state[QUAT + 2], -state[QUAT + 3]
-    out[_TURN], out[_TURN + 3] = half_cos * w - half_sin * z, half_cos * z + half_sin * w
-    out[_TURN + 1], out[_TURN + 2] = half_cos * x - half_sin * y, half_cos * y + half_sin * x
 
 
 class HilSensors:
@@ -100,7 +71,7 @@ class HilSensors:
         turned = (math.cos(heading), math.sin(heading), math.cos(0.5 * heading), math.sin(0.5 * heading))
         self._axes = np.array([*frame.origin, *turned])
         self._field = np.array(FIELD_NED_GAUSS)
-        self._out = np.empty(_READING)
+        self._out = np.empty(READING)
         self._generator = np.random.Generator(np.random.PCG64([seed, 4]))
         self._draw = self._normals()
         self._packer = FramePacker(SYSTEM_ID, COMPONENT_ID)
@@ -120,10 +91,10 @@ class HilSensors:
         steps, state = self._simulation.steps, self._simulation.state_row
         time_us = round(steps * STEP_S * 1e6)
         force, rate = self._dynamics.specific_force_m_s2, self._dynamics.rate_rad_s
-        _read(state, force, rate, self._field, self._axes, self._out)
+        read_truth(state, force, rate, self._field, self._axes, self._out)
         reading = self._out.tolist()
         messages: list[Message] = []
-        if self._gps and steps % GPS_STEPS == 0:
+        if self._gps and steps % GPS_STEPS == 0 and self._simulation.faults.active("gps_loss", self._simulation.time_s) is None:
             messages.append(self._gps_message(time_us, reading))
         if not self._gps and math.floor(steps * _VISION_PER_STEP) > math.floor((steps - 1) * _VISION_PER_STEP):
             messages.append(self._vision_message(time_us, reading))
@@ -140,43 +111,43 @@ class HilSensors:
     def _sensor_message(self, steps: int, time_us: int, reading: list[float]) -> Message:
         noise, draw = self._noise, self._draw
         updated = INERTIAL | (steps % MAGNETIC_STEPS == 0) * MAGNETIC | (steps % PRESSURE_STEPS == 0) * PRESSURE
-        force = [value + noise.accelerometer_m_s2 * draw() for value in reading[_FORCE:_RATE]]
-        rate = [value + noise.gyroscope_rad_s * draw() for value in reading[_RATE:_FIELD]]
-        field = [value + noise.magnetometer_gauss * draw() for value in reading[_FIELD:_PLACE]]
-        altitude_m = self._frame.altitude_m - reading[_PLACE + 2]
+        force = [value + noise.accelerometer_m_s2 * draw() for value in reading[FORCE:RATE]]
+        rate = [value + noise.gyroscope_rad_s * draw() for value in reading[RATE:FIELD]]
+        field = [value + noise.magnetometer_gauss * draw() for value in reading[FIELD:PLACE]]
+        altitude_m = self._frame.altitude_m - reading[PLACE + 2]
         pressure = pressure_pa(altitude_m) + noise.barometer_pa * draw()
         return mav.MAVLink_hil_sensor_message(time_us, *force, *rate, *field, 0.01 * pressure, 0.0, altitude_m, 20.0, updated)
 
     def _gps_message(self, time_us: int, reading: list[float]) -> Message:
         noise, draw = self._noise, self._draw
         sigmas = (noise.gps_horizontal_m, noise.gps_horizontal_m, noise.gps_vertical_m)
-        north, east, down = (value + sigma * draw() for value, sigma in zip(reading[_PLACE:_SPEED], sigmas, strict=True))
+        north, east, down = (value + sigma * draw() for value, sigma in zip(reading[PLACE:SPEED], sigmas, strict=True))
         latitude, longitude, altitude = self._frame.to_global((north, east, down))
-        vn, ve, vd = (_cm_s(value + noise.gps_speed_m_s * draw()) for value in reading[_SPEED:_TURN])
+        vn, ve, vd = (_cm_s(value + noise.gps_speed_m_s * draw()) for value in reading[SPEED:TURN])
         course = round(100.0 * math.degrees(math.atan2(ve, vn))) % 36000
         place = (round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude))
         return mav.MAVLink_hil_gps_message(time_us, 3, *place, 30, 40, round(math.hypot(vn, ve)), vn, ve, vd, course, 12)
 
     def _truth_message(self, time_us: int, reading: list[float], rate: list[float]) -> Message:
-        north, east, down = reading[_PLACE:_SPEED]
+        north, east, down = reading[PLACE:SPEED]
         latitude, longitude, altitude = self._frame.to_global((north, east, down))
-        speed = [_cm_s(value) for value in reading[_SPEED:_TURN]]
-        change = [_int16(1e3 * value / GRAVITY_M_S2) for value in reading[_CHANGE:_READING]]
+        speed = [_cm_s(value) for value in reading[SPEED:TURN]]
+        change = [_int16(1e3 * value / GRAVITY_M_S2) for value in reading[CHANGE:READING]]
         air = min(_SPEED_LIMIT_CM_S, round(math.hypot(*speed)))
         place = (round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude))
         p, q, r = rate
         return mav.MAVLink_hil_state_quaternion_message(
-            time_us, reading[_TURN:_CHANGE], p, -q, -r, *place, *speed, air, air, *change
+            time_us, reading[TURN:CHANGE], p, -q, -r, *place, *speed, air, air, *change
         )
 
     def _vision_message(self, time_us: int, reading: list[float]) -> Message:
         noise, draw = self._noise, self._draw
-        place = [value + noise.vision_m * draw() for value in reading[_PLACE:_SPEED]]
-        turn = _disturbed(reading[_TURN:_CHANGE], [noise.vision_rad * draw() for _ in range(3)])
-        (w, x, y, z), (north, east, down) = reading[_TURN:_CHANGE], reading[_SPEED:_TURN]
+        place = [value + noise.vision_m * draw() for value in reading[PLACE:SPEED]]
+        turn = _disturbed(reading[TURN:CHANGE], [noise.vision_rad * draw() for _ in range(3)])
+        (w, x, y, z), (north, east, down) = reading[TURN:CHANGE], reading[SPEED:TURN]
         speed = [v + noise.vision_speed_m_s * draw() for v in rotate_to_body((w, x, y, z), (north, east, down))]
         return mav.MAVLink_odometry_message(
-            *(time_us, mav.MAV_FRAME_LOCAL_NED, _BODY_FRD, *place, turn, *speed, *reading[_RATE:_FIELD]),
+            *(time_us, mav.MAV_FRAME_LOCAL_NED, _BODY_FRD, *place, turn, *speed, *reading[RATE:FIELD]),
             *(_covariance(noise.vision_m, noise.vision_rad), _covariance(noise.vision_speed_m_s, noise.vision_rad)),
             *(0, mav.MAV_ESTIMATOR_TYPE_VIO, 90),
         )

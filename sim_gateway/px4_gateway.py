@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sim_gateway.errors import DynamicsError
-from sim_gateway.faults import Fault
+from sim_gateway.faults import KINDS, SCAN, Fault, only_possible
 from sim_gateway.flight_report import FlightRecorder, world_facts, write_report
 from sim_gateway.hil_sensors import HilSensors
 from sim_gateway.lidar import LidarConfig
@@ -25,7 +25,7 @@ from sim_gateway.lidar_devices import LidarDevices
 from sim_gateway.local_frame import LocalFrame
 from sim_gateway.motor_dynamics import NONE_IRIS, MotorDynamics, standing_height_m
 from sim_gateway.pace import Pace
-from sim_gateway.px4_wire import DEFAULT_PORT, Controls, Px4GoneError, SerialLine, TcpLine, open_line
+from sim_gateway.px4_wire import DEFAULT_PORT, Controls, Px4GoneError, Px4LineError, SerialLine, TcpLine, open_line
 from sim_gateway.scene import Point, World
 from sim_gateway.scip import DEFAULT_PORT as LIDAR_PORT
 from sim_gateway.simulation import Simulation, WindConfig
@@ -36,6 +36,7 @@ _FREE_WAIT_S = STEP_S  # until its first answer PX4 is still starting: no step w
 _SILENCE_S = 0.5  # a controller in HITL that says nothing for so long has its motors stopped
 _HEARTBEAT_STEPS = 250
 _MAX_STEPS_PER_TURN = 25
+_FAULTS = (*(name for name, kind in KINDS.items() if kind.group == SCAN), "gps_loss", "wind", "gust", "motor_weak", "heavy")
 
 _log = logging.getLogger("sim_gateway.px4")
 
@@ -59,11 +60,15 @@ class Px4Config:
 
 
 class Px4Gateway:
-    """Simulator role for one PX4. Use as a context manager; `run` returns when PX4 has gone or when asked to stop."""
+    """Simulator role for one PX4. Use as a context manager; `run` returns when PX4 has gone or when asked to stop.
+
+    Raises `Px4LineError`, `ScipServerError`, and `FaultError` for faults that only our own autopilot can have.
+    """
 
     def __init__(self, world: World, config: Px4Config | None = None) -> None:
         self.world, self.config = world, config or Px4Config()
         config = self.config
+        only_possible(config.faults, _FAULTS, ("start", "armed"), "--px4")
         self.dynamics = MotorDynamics()
         self.simulation = Simulation(
             *(world, NONE_IRIS, LidarConfig.device(), "none", WindConfig(mean_m_s=config.wind_m_s), config.seed),
@@ -74,6 +79,9 @@ class Px4Gateway:
         for fault in config.faults:
             self.simulation.inject(fault)
         self.line = open_line(config.address)
+        if not self.line.lockstep and config.speed != 1.0:
+            self.line.close()
+            raise Px4LineError("a flight controller has its own time: leave --speed out")
         self.frame = LocalFrame((*world.start[:2], standing), config.heading_rad)
         self.sensors = HilSensors(
             *(self.simulation, self.dynamics, self.frame, config.seed), gps=config.gps, truth=self.line.lockstep
@@ -203,7 +211,9 @@ class Px4Gateway:
             self._armed = newest.armed
             self.recorder.note_event(self.simulation.time_s, armed=newest.armed)
             _log.info("%.2f s: %s", self.simulation.time_s, "armed" if newest.armed else "disarmed")
-            if not newest.armed:
+            if newest.armed:
+                self.simulation.faults.happened("armed", self.simulation.time_s)
+            else:
                 self.write_report()
 
     def write_report(self) -> None:

@@ -207,5 +207,5 @@ def _listen(port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         reason = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
-        raise Px4LineError(f"TCP port {port} for PX4 {reason}") from error
+        raise Px4LineError(f"TCP port {port} for PX4 {reason}: stop the program there, or --px4 tcp:PORT with another") from error
     return listener

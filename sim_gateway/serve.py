@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from sim_gateway.errors import DynamicsMissingError, UsageError
+from sim_gateway.faults import FaultError
 from sim_gateway.fleet import Fleet, NoRoomError
 from sim_gateway.follow_gateway import FollowConfig, FollowGateway
 from sim_gateway.follow_gateway import warm_up as warm_up_follow
@@ -36,7 +37,7 @@ def _usage_errors() -> Iterator[None]:
     """What cannot be opened is told as the option that opens something else."""
     try:
         yield
-    except (DynamicsMissingError, LinkSpecError, SerialPortError) as error:
+    except (DynamicsMissingError, FaultError, LinkSpecError, Px4LineError, SerialPortError) as error:
         raise UsageError(str(error)) from None
     except NoRoomError as error:
         raise UsageError(f"{error}: fewer --vehicles, or another --start") from None
@@ -44,8 +45,6 @@ def _usage_errors() -> Iterator[None]:
         raise UsageError(f"{error}: stop the program there, or choose another: --onboard-port, --gcs-port, --link") from None
     except FollowUrlError as error:
         raise UsageError(f"--follow {error}") from None
-    except Px4LineError as error:
-        raise UsageError(f"{error}: choose another with --px4") from None
     except ScipServerError as error:
         raise UsageError(f"{error} with --lidar-port") from None
     except FileExistsError as error:

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mav
 
+from sim_gateway.faults import Fault, FaultError
 from sim_gateway.frame_reader import FrameReader, decode
 from sim_gateway.hil_sensors import INERTIAL, MAGNETIC, PRESSURE
 from sim_gateway.mavlink_frame import FramePacker
@@ -174,6 +175,21 @@ def test_without_gps_vision_tells_where_it_is() -> None:
     assert [newest.pose_covariance[i] for i in (0, 6, 11, 15)] == pytest.approx([4e-4] * 3 + [1e-4])
 
 
+def test_gps_can_be_lost_and_faults_of_our_own_autopilot_are_refused() -> None:
+    with _flown(faults=(Fault.parse("gps_loss@armed:1+2"),)) as (_, px4):
+        px4.start()
+        px4.fly(0.5)
+        px4.controller.armed = True
+        steps = px4.fly(4.0)
+    fixes = [message.time_usec * 1e-6 for step in steps for message in step.before if message.get_type() == "HIL_GPS"]
+    gaps = np.diff(fixes)
+    assert max(gaps) == pytest.approx(2.1, abs=0.11)
+    assert sorted(gaps)[-2] == pytest.approx(0.1)
+    for text, word in (("refuse_offboard@1", "refuse_offboard cannot happen"), ("wind@offboard:1", "wait for: start, armed")):
+        with pytest.raises(FaultError, match=word):
+            Px4Gateway(WORLD, Px4Config(address="tcp:0", lidar_port=0, faults=(Fault.parse(text),)))
+
+
 def test_wrong_checksums_and_garbage_move_no_motor_and_break_nothing() -> None:
     with _flown() as (gateway, px4):
         px4.start()
@@ -235,6 +251,12 @@ _REFUSED = ["tcp:", "tcp:x", "tcp:70000", "udp:14540", "serial:", "serial:/dev/n
 def test_addresses_that_are_refused(address: str) -> None:
     with pytest.raises(Px4LineError, match=r"give|cannot be opened"):
         open_line(address)
+
+
+def test_a_flight_controller_is_not_hurried() -> None:
+    controller = _Controller()
+    with pytest.raises(Px4LineError, match="its own time"):
+        Px4Gateway(WORLD, Px4Config(address=f"serial:{controller.path},921600", speed=0.0))
 
 
 # ---- a flight controller on a serial line
