@@ -17,7 +17,8 @@ from contextlib import ExitStack, contextmanager
 from sim_gateway.corridor import CorridorConfig, generate_corridor
 from sim_gateway.fleet import Fleet
 from sim_gateway.flight_modes import FlightMode, Result
-from sim_gateway.gateway import GROUND_PORT_OFFSET, ONBOARD_PORT_OFFSET, GatewayConfig, step_all
+from sim_gateway.gateway import GatewayConfig, step_all
+from sim_gateway.open_links import GROUND_PORT_OFFSET, ONBOARD_PORT_OFFSET
 from sim_gateway.piloted import PilotedVehicle
 from sim_gateway.setpoints import OffboardSetpoint
 from sim_gateway.simulation import Simulation

@@ -1,8 +1,9 @@
 """How fast the simulator is, in processor time of one core, and whether its memory stays flat.
 
 A vehicle with autopilot and LiDAR (180 beams, 20 Hz) flies OFFBOARD in lockstep, with internal dynamics and with JSBSim; 20
-vehicles fly with all their telemetry; one flies for a simulated hour. Speeds are simulated seconds per second of processor time:
-the wall clock of a shared machine says little. Takes some minutes, most of them for the hour.
+vehicles fly with all their telemetry; one is flown over PX4's simulator interface; one flies for a simulated hour. Speeds are
+simulated seconds per second of processor time: the wall clock of a shared machine says little. Takes some minutes, most of them
+for the hour.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json as json_module
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +20,9 @@ from typing import Any
 
 from benchmarks._gateway_flight import WORLD, fleet, fly, single
 from benchmarks.memory import slope_mib_h
+from sim_gateway.px4_gateway import Px4Config, Px4Gateway, warm_up
 from sim_gateway.simulation import Simulation
+from sim_gateway.vehicle import STEP_S
 
 ROOT = Path(__file__).resolve().parent.parent
 SPEED_TARGETS = {"internal": 200.0, "jsbsim": 30.0}
@@ -28,6 +32,8 @@ SLOPE_MIB_H = 5.0
 """Allowed growth over an hour: the vehicle's own log of the flight (2.3 MiB, ends at 4) and the allocator's rounding."""
 RESET_MS, RESETS = 10.0, 20
 DEADLINE_S = 3600.0
+PX4_SPAN_S, PX4_SPEED, PX4_STEP_S = 20.0, 8.0, 200e-6
+"""How fast a real PX4 and its simulator have to be together, and what PX4 itself was seen to take for a step."""
 
 Figure = dict[str, Any]
 
@@ -35,7 +41,7 @@ Figure = dict[str, Any]
 def run(json: bool, minutes: float = 60.0) -> list[Figure]:
     """Speeds to real time, share of a core of 20 vehicles, reset in ms, memory and its slope."""
     figures = speed_figures()
-    figures.append(fleet_figure())
+    figures += [fleet_figure(), px4_figure()]
     figures += [reset_figure(name) for name in SPEED_TARGETS]
     return [*figures, *memory_figures(minutes)]
 
@@ -60,6 +66,22 @@ def fleet_figure() -> Figure:
     with fleet(VEHICLES) as (vehicles, advance):
         seconds = _processor_s(lambda: fly(vehicles, advance, FLEET_SPAN_S, lambda: None))
     return _figure(f"{VEHICLES} vehicles with full telemetry", seconds / FLEET_SPAN_S, "cores", FLEET_SHARE)
+
+
+def px4_figure() -> Figure:
+    """The simulator's part of the lockstep with PX4: physics, sensors, LiDAR and wire. What it may take leaves PX4 its own."""
+    config = Px4Config(address="tcp:0", speed=0.0, lidar_port=0, max_time_s=PX4_SPAN_S)
+    warm_up(WORLD)
+    with Px4Gateway(WORLD, config) as gateway:
+        port = gateway.ready_message()["px4"].removeprefix("tcp:")
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        stand_in = subprocess.Popen([sys.executable, "-m", "benchmarks._px4_echo", port], cwd=ROOT, env=environment)
+        seconds = _processor_s(lambda: gateway.run(threading.Event()))
+    stand_in.wait(10.0)
+    target = 1.0 / (1.0 / PX4_SPEED - PX4_STEP_S / STEP_S)
+    return _figure(
+        "simulator of a real PX4, its part of the lockstep", PX4_SPAN_S / seconds, "x real time", target, at_least=True
+    )
 
 
 def reset_figure(dynamics: str) -> Figure:

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
-import os
-import signal
-import stat
 import sys
-import threading
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sim_gateway.errors import UsageError
+
 if TYPE_CHECKING:
     from sim_gateway.faults import Fault
-    from sim_gateway.gateway import GatewayConfig
+    from sim_gateway.link_spec import LinkSpec
     from sim_gateway.scene import World
 
 _EPILOG = """
@@ -38,9 +35,18 @@ sim-gateway --world configs/worlds/corridor.yaml --vehicles 3
 
 sim-gateway --world configs/worlds/corridor.yaml --serial-lidar ld06 --serial-link /tmp/lidar
 
+sim-gateway --world configs/worlds/corridor.yaml --link udp:14540,delay_ms=50,loss=0.02 --link pty:/tmp/mavlink,baud=57600
+
+sim-gateway --world configs/worlds/corridor.yaml --px4
+
+sim-gateway --world configs/worlds/corridor.yaml --px4 serial:/dev/ttyACM0,921600
+
+sim-gateway --world configs/worlds/corridor.yaml --follow udpin://127.0.0.1:14551 --heading 90
+
 Then connect a MAVSDK client to udpin://127.0.0.1:14540 and a Hokuyo SCIP driver to 127.0.0.1:10940.
 """
 _MOST_VEHICLES = 40  # then the onboard ports would meet the gateway's own
+_PX4_DEFAULT = "tcp:4560"
 _HIGHEST_PORT = 65535 - 4020 - _MOST_VEHICLES  # the gateway's own ports lie up to this far above the client's
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich")
@@ -76,8 +82,42 @@ class SerialKind(StrEnum):
     rplidar = "rplidar"
 
 
-class _UsageError(Exception):
-    """A mistake of the user's; one line that says what to change."""
+_Links = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="KIND:PLACE,NAME=VALUE",
+        help="A MAVLink link (udp, tcp, serial, pty), or how good the one on that UDP port is, such as "
+        "udp:14540,delay_ms=50,jitter_ms=10,loss=0.02,dup=0.01 or pty:/tmp/mavlink,baud=57600; repeatable.",
+    ),
+]
+_Px4 = Annotated[
+    str | None,
+    typer.Option(
+        metavar="[tcp:PORT|serial:DEVICE,BAUD]",
+        help="Be the simulator of a real PX4 (SITL: airframe 10016 none_iris; serial: HITL) instead. Alone: tcp:4560.",
+    ),
+]
+_NoGps = Annotated[bool, typer.Option("--no-gps", help="With --px4: vision odometry instead of GPS.")]
+_Follow = Annotated[
+    str | None,
+    typer.Option(
+        metavar="URL",
+        help="Serve the LiDAR of a vehicle that is elsewhere and reports its pose here instead: udpin://127.0.0.1:14551, "
+        "udpout://, tcp:// or serial://DEVICE:BAUD.",
+    ),
+]
+_Origin = Annotated[
+    str | None, typer.Option(metavar="X,Y,Z", help="With --follow: its local origin in the corridor, m; default: start.")
+]
+_PoseTimeout = Annotated[
+    float, typer.Option(min=0.01, max=10.0, help="With --follow: a pose older than this, s, stops the scans.")
+]
+_PoseLatency = Annotated[
+    float, typer.Option(min=-1.0, max=1.0, help="With --follow: s by which a pose is older than its stamp tells.")
+]
+_Speed = Annotated[
+    float, typer.Option(min=0.0, max=100.0, help="Vehicle seconds per second; 0, with --px4: as fast as PX4 answers.")
+]
 
 
 @app.command(epilog=_EPILOG)
@@ -97,6 +137,7 @@ def serve(
     onboard_port: Annotated[int, typer.Option(min=1, max=_HIGHEST_PORT, help="UDP port of the onboard client.")] = 14540,
     gcs_port: Annotated[int, typer.Option(min=0, max=_HIGHEST_PORT, help="UDP port of the ground station; 0: none.")] = 14550,
     lidar_port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the LiDAR; 0: any free one.")] = 10940,
+    link: _Links = None,
     serial_lidar: Annotated[SerialKind | None, typer.Option(help="Also a spinning LiDAR on a pseudo-terminal.")] = None,
     serial_link: Annotated[Path | None, typer.Option(help="Symbolic link to that pseudo-terminal.")] = None,
     fault: Annotated[
@@ -105,7 +146,13 @@ def serve(
     ] = None,
     faults: Annotated[Path | None, typer.Option(help="Scenario file (YAML) of faults.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write the true path, contacts and events here (JSON).")] = None,
-    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Vehicle seconds per second.")] = 1.0,
+    px4: _Px4 = None,
+    no_gps: _NoGps = False,
+    follow: _Follow = None,
+    origin: _Origin = None,
+    pose_timeout: _PoseTimeout = 0.3,
+    pose_latency: _PoseLatency = 0.0,
+    speed: _Speed = 1.0,
     max_time: Annotated[float, typer.Option(min=0.0, help="Stop after this many vehicle seconds; 0: never.")] = 0.0,
     quit_with_parent: Annotated[
         bool, typer.Option("--quit-with-parent", help="Stop when stdin closes or the parent dies.")
@@ -118,90 +165,52 @@ def serve(
     """
     _log_to_stderr(verbose)
     scene = _load(world, seed, start, goal)
+    common: dict[str, Any] = {
+        "seed": scene.seed,
+        "lidar_port": lidar_port,
+        "heading_rad": math.radians(_finite("--heading", heading)),
+        "max_time_s": max_time or math.inf,
+        "report": report,
+        "serial_lidar": serial_lidar.value if serial_lidar is not None else None,
+        "serial_link": serial_link,
+        "faults": _faults(fault or [], faults),
+    }
+    moving: dict[str, Any] = {"speed": speed, "wind_m_s": _triple("--wind", wind)}
+    if (speed == 0.0 or no_gps) and px4 is None:
+        raise UsageError(f"{'--no-gps' if no_gps else '--speed 0'} goes only with --px4")
+    if px4 is not None:
+        _be_simulator(scene, quit_with_parent, address=px4, gps=not no_gps, **common, **moving)
+    elif follow is not None:
+        if speed != 1.0:
+            raise UsageError("--speed: a vehicle that is elsewhere has its own time; leave it out")
+        place = _triple("--origin", origin) if origin is not None else None
+        times = {"timeout_s": pose_timeout, "latency_s": pose_latency}
+        _follow_vehicle(scene, quit_with_parent, url=follow, origin_m=place, **times, **common)
+    else:
+        ports = {"onboard_port": onboard_port, "gcs_port": gcs_port, "links": _links(link or [])}
+        kinds = {"dynamics": dynamics.value, "vehicle": vehicle.value, "estimate": estimate.value}
+        _stand_in(scene, vehicles, quit_with_parent, **ports, **kinds, **common, **moving)
+
+
+def _stand_in(world: World, vehicles: int, quit_with_parent: bool, **settings: Any) -> None:
     from sim_gateway.gateway import GatewayConfig
+    from sim_gateway.serve import serve_fleet
 
-    config = GatewayConfig(
-        seed=scene.seed,
-        onboard_port=onboard_port,
-        gcs_port=gcs_port,
-        lidar_port=lidar_port,
-        dynamics=dynamics.value,
-        vehicle=vehicle.value,
-        estimate=estimate.value,
-        wind_m_s=_triple("--wind", wind),
-        heading_rad=math.radians(_finite("--heading", heading)),
-        speed=speed,
-        max_time_s=max_time or math.inf,
-        report=report,
-        serial_lidar=serial_lidar.value if serial_lidar is not None else None,
-        serial_link=serial_link,
-        faults=_faults(fault or [], faults),
-    )
-    _serve(scene, config, vehicles, quit_with_parent)
+    serve_fleet(world, GatewayConfig(**settings), vehicles, quit_with_parent)
 
 
-def _serve(world: World, config: GatewayConfig, vehicles: int, quit_with_parent: bool) -> None:
-    from sim_gateway.errors import DynamicsMissingError
-    from sim_gateway.fleet import Fleet, NoRoomError
-    from sim_gateway.gateway import warm_up
-    from sim_gateway.mavlink_links import PortInUseError
-    from sim_gateway.scip import ScipServerError
+def _be_simulator(world: World, quit_with_parent: bool, **settings: Any) -> None:
+    from sim_gateway.px4_gateway import Px4Config
+    from sim_gateway.serve import serve_px4
 
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    if quit_with_parent:
-        _follow_parent(stop)
-    try:
-        warm_up(world, config.dynamics)
-        fleet = Fleet(world, config, vehicles)
-    except DynamicsMissingError as error:
-        raise _UsageError(str(error)) from None
-    except NoRoomError as error:
-        raise _UsageError(f"{error}: fewer --vehicles, or another --start") from None
-    except PortInUseError as error:
-        raise _UsageError(f"{error}: stop the program there, or choose another with --onboard-port or --gcs-port") from None
-    except ScipServerError as error:
-        raise _UsageError(f"{error} with --lidar-port") from None
-    except FileExistsError:
-        raise _UsageError(f"--serial-link {config.serial_link} exists and is not a link: choose another name") from None
-    with fleet:
-        print(json.dumps(fleet.ready_message()), flush=True)
-        for gateway in fleet.gateways:
-            logging.getLogger("sim_gateway").info(
-                "world %s, vehicle %d: MAVLink to udpin://127.0.0.1:%d, LiDAR on TCP port %d; Ctrl-C stops",
-                *(world.name, gateway.config.system_id, gateway.config.onboard_port, gateway.lidar.port),
-            )
-        fleet.run(stop)
+    serve_px4(world, Px4Config(**settings), quit_with_parent)
 
 
-def _follow_parent(stop: threading.Event) -> None:
-    """Set `stop` when stdin, if it is a pipe, ends or this process gets another parent.
+def _follow_vehicle(world: World, quit_with_parent: bool, **settings: Any) -> None:
+    from sim_gateway.follow_gateway import FollowConfig
+    from sim_gateway.serve import serve_follow
 
-    Not by Linux's parent-death signal: that one comes already when the thread that started this process ends.
-    """
-    parent = os.getppid()
-
-    def read_to_end() -> None:
-        while os.read(sys.stdin.fileno(), 4096):  # not sys.stdin.buffer: a thread inside its lock aborts the interpreter at exit
-            pass
-        stop.set()
-
-    def watch_parent() -> None:
-        while not stop.wait(0.5):
-            if os.getppid() != parent:
-                stop.set()
-
-    for watcher in (read_to_end, watch_parent) if _stdin_is_pipe() else (watch_parent,):
-        threading.Thread(target=watcher, daemon=True).start()
-
-
-def _stdin_is_pipe() -> bool:
-    try:
-        mode = os.fstat(0).st_mode
-    except OSError:  # no stdin at all
-        return False
-    return stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode)
+    serve_follow(world, FollowConfig(**settings), quit_with_parent)
 
 
 def _load(path: Path, seed: int | None, start: str | None, goal: str | None) -> World:
@@ -221,7 +230,7 @@ def _load(path: Path, seed: int | None, start: str | None, goal: str | None) -> 
         world = replace(world, goal=_triple("--goal", goal))
     for name, point in (("start", world.start), ("goal", world.goal)):
         if clearance_m(world.boxes_at(0.0), np.array(point), 0.0) <= 0.0:
-            raise _UsageError(f"--{name} {point} lies inside an obstacle: choose another place")
+            raise UsageError(f"--{name} {point} lies inside an obstacle: choose another place")
     return world
 
 
@@ -231,7 +240,16 @@ def _faults(texts: list[str], file: Path | None) -> tuple[Fault, ...]:
     try:
         return (*(load_faults(file) if file is not None else ()), *(Fault.parse(text) for text in texts))
     except FaultError as error:
-        raise _UsageError(str(error)) from None
+        raise UsageError(str(error)) from None
+
+
+def _links(texts: list[str]) -> tuple[LinkSpec, ...]:
+    from sim_gateway.link_spec import LinkSpec, LinkSpecError
+
+    try:
+        return tuple(LinkSpec.parse(text) for text in texts)
+    except LinkSpecError as error:
+        raise UsageError(str(error)) from None
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:
@@ -240,7 +258,7 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count or not all(math.isfinite(value) for value in values):
-        raise _UsageError(f"{option} {text!r}: give {count} finite numbers separated by commas, without spaces")
+        raise UsageError(f"{option} {text!r}: give {count} finite numbers separated by commas, without spaces")
     return values
 
 
@@ -251,7 +269,7 @@ def _triple(option: str, text: str) -> tuple[float, float, float]:
 
 def _finite(option: str, value: float) -> float:
     if not math.isfinite(value):
-        raise _UsageError(f"{option} {value}: give a finite number")
+        raise UsageError(f"{option} {value}: give a finite number")
     return value
 
 
@@ -265,17 +283,25 @@ def _log_to_stderr(verbose: bool) -> None:
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 
+def completed(arguments: list[str]) -> list[str]:
+    """The arguments with the value that `--px4` alone stands for."""
+    given: list[str] = []
+    for argument, after in zip(arguments, [*arguments[1:], "--"], strict=True):
+        given += [argument, _PX4_DEFAULT] if argument == "--px4" and after.startswith("-") else [argument]
+    return given
+
+
 def main() -> None:
     """Entry point: a user's mistake is one line on stderr and exit code 2; a vehicle that diverged, exit code 1."""
     from sim_gateway.errors import DivergedError
     from strict_yaml import ConfigError
 
     try:
-        code = app(standalone_mode=False)
+        code = app(completed(sys.argv[1:]), standalone_mode=False)
     except DivergedError as error:
         print(f"sim-gateway: {error}", file=sys.stderr)
         code = 1
-    except (_UsageError, ConfigError) as error:
+    except (UsageError, ConfigError) as error:
         print(f"sim-gateway: {error}", file=sys.stderr)
         code = 2
     except Exception as error:

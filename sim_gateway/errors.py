@@ -1,6 +1,10 @@
-"""What can go wrong with the simulated vehicle. Light to import."""
+"""What can go wrong with the simulated vehicle, or with how it was asked for. Light to import."""
 
 from __future__ import annotations
+
+
+class UsageError(Exception):
+    """A mistake of the user's; one line that says what to change."""
 
 
 class DynamicsError(RuntimeError):

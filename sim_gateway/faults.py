@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -151,6 +152,15 @@ class Fault(BaseModel):
             return cls.model_validate(record | {"duration_s": float(duration) if duration else None})
         except (ValidationError, ValueError) as error:
             raise FaultError(f"fault {text!r}: {_first_message(error)}") from None
+
+
+def only_possible(faults: Iterable[Fault], possible: Collection[str], events: Collection[str], role: str) -> None:
+    """Raise `FaultError` unless all kinds and events of these faults exist in a role of the gateway."""
+    for fault in faults:
+        if fault.kind not in possible:
+            raise FaultError(f"{fault.kind} cannot happen with {role}; there are: {', '.join(possible)}")
+        if fault.after not in events:
+            raise FaultError(f"{fault.kind}: with {role} a fault can wait for: {', '.join(events)}")
 
 
 class Scenario(BaseModel):

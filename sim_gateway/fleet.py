@@ -13,6 +13,7 @@ import numpy as np
 
 from sim_gateway.collision import clearance_m
 from sim_gateway.gateway import Gateway, GatewayConfig, run_together
+from sim_gateway.open_links import nth_links
 from sim_gateway.scene import Point, World
 
 SPACING_M = 1.2
@@ -74,6 +75,7 @@ def nth_config(config: GatewayConfig, index: int) -> GatewayConfig:
         lidar_port=config.lidar_port + index if config.lidar_port else 0,
         report=_numbered(config.report, index),
         serial_link=_numbered(config.serial_link, index),
+        links=nth_links(config.links, index, config.gcs_port),
     )
 
 

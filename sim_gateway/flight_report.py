@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 from pathlib import Path
@@ -11,12 +12,15 @@ from typing import Any
 import numpy as np
 
 from sim_gateway.autopilot import ModeChange
+from sim_gateway.scene import World
 from sim_gateway.simulation import Simulation
 
 SAMPLE_STEPS = 12.5  # 20 Hz in steps of 4 ms
 TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "vx", "vy", "vz", "yaw")
 _MAX_ROWS = 72_000  # an hour; then every other row is dropped and the interval doubles
 _MAX_EVENTS = 10_000
+
+_log = logging.getLogger("sim_gateway")
 
 
 class FlightRecorder:
@@ -65,16 +69,13 @@ class FlightRecorder:
 
     def note(self, change: ModeChange) -> None:
         """A mode change, an arming or a disarming."""
+        modes = {"mode": change.mode.px4_name, "intended": change.intended.px4_name}
+        self.note_event(change.time_s, **modes, armed=change.armed, failsafe=change.failsafe)
+
+    def note_event(self, time_s: float, **facts: Any) -> None:
+        """Something that happened at a vehicle time."""
         if len(self.events) < _MAX_EVENTS:
-            self.events.append(
-                {
-                    "t": round(change.time_s, 3),
-                    "mode": change.mode.px4_name,
-                    "intended": change.intended.px4_name,
-                    "armed": change.armed,
-                    "failsafe": change.failsafe,
-                }
-            )
+            self.events.append({"t": round(time_s, 3), **facts})
 
     def as_dict(self, **timing: float) -> dict[str, Any]:
         """The report; `timing` is added as it is."""
@@ -88,6 +89,38 @@ class FlightRecorder:
             "events": self.events,
             "trajectory": {"columns": TRAJECTORY_COLUMNS, "rows": self.rows},
         }
+
+
+def world_facts(world: World) -> dict[str, Any]:
+    """What a report says about the world."""
+    return {
+        "world": world.name,
+        "world_seed": world.seed,
+        "size_m": [world.length_m, world.width_m, world.height_m],
+        "start": list(world.start),
+        "start_yaw_rad": world.start_yaw_rad,
+        "goal": list(world.goal),
+        "boxes": world.static_boxes.tolist(),
+        "movers": [
+            {
+                "size_m": list(mover.size_m),
+                "x_m": mover.x_m,
+                "z_m": mover.z_m,
+                "y_m": [mover.y_low_m, mover.y_high_m],
+                "speed_m_s": mover.speed_m_s,
+                "phase_m": mover.phase_m,
+            }
+            for mover in world.movers
+        ],
+    }
+
+
+def write_report(path: Path, content: dict[str, Any]) -> None:
+    """Write a report; a file that cannot be written is said, not fatal."""
+    try:
+        write_json_atomically(path, content)
+    except OSError as error:
+        _log.error("the report %s cannot be written: %s", path, error.strerror)
 
 
 def write_json_atomically(path: Path, content: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ import select
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,25 +20,24 @@ from numpy.typing import NDArray
 
 from sim_gateway.errors import DynamicsError
 from sim_gateway.faults import Fault
-from sim_gateway.flight_report import FlightRecorder, write_json_atomically
+from sim_gateway.flight_report import FlightRecorder, world_facts, write_report
 from sim_gateway.incidents import Incidents
 from sim_gateway.lidar import LidarConfig
+from sim_gateway.lidar_devices import LidarDevices
 from sim_gateway.link_faults import LinkFaults
-from sim_gateway.mavlink_links import UdpLink
+from sim_gateway.link_spec import LinkSpec
 from sim_gateway.mavlink_server import MavlinkServer
+from sim_gateway.open_links import link_plan, open_links, ready_links
 from sim_gateway.pace import Pace
 from sim_gateway.piloted import PilotedVehicle
 from sim_gateway.report_faults import ReportFaults
 from sim_gateway.scene import Point, World
-from sim_gateway.scip import DEFAULT_PORT, ScipServer
-from sim_gateway.serial_lidar import SerialLidar
-from sim_gateway.simulation import Scan, Simulation, WindConfig, step_at
+from sim_gateway.scip import DEFAULT_PORT
+from sim_gateway.simulation import Simulation, WindConfig
 from sim_gateway.telemetry import Telemetry
 from sim_gateway.vehicle import STEP_S
 from sim_gateway.vehicle_params import PROFILES
 
-# distance from the port a client listens on to the gateway's own port, as in PX4's SITL (14580 - 14540, 18570 - 14550)
-ONBOARD_PORT_OFFSET, GROUND_PORT_OFFSET = 40, 4020
 _TELL_EVERY_S = 0.2
 _MAX_STEPS_PER_TURN = 25
 _LONGEST_WAIT_S = 0.02
@@ -49,6 +48,8 @@ _log = logging.getLogger("sim_gateway")
 @dataclass(frozen=True, slots=True)
 class GatewayConfig:
     """How to run. Ports are those the clients use; `gcs_port` 0 leaves that link out, `lidar_port` 0 takes a free one.
+
+    `links`: further links, or the quality of these two (a UDP link to the same port).
 
     `dynamics`: a name of `dynamics.DYNAMICS`, `vehicle` one of `vehicle_params.PROFILES`. `system_id`: 1 to 250; as with PX4's
     instances, the own ground station port lies that many less one further up. `serial_lidar`: also a spinning LiDAR of this kind
@@ -71,6 +72,7 @@ class GatewayConfig:
     serial_lidar: str | None = None
     serial_link: Path | None = None
     faults: tuple[Fault, ...] = ()
+    links: tuple[LinkSpec, ...] = ()
 
 
 def connect_faults(vehicle: PilotedVehicle, server: MavlinkServer, telemetry: Telemetry, seed: int) -> Incidents:
@@ -111,28 +113,25 @@ class Gateway:
         pilot, frame = self.vehicle.autopilot, self.vehicle.frame
         self.recorder = FlightRecorder(self.vehicle.simulation, self._facts())
         self.telemetry = Telemetry(pilot, frame, self.vehicle.snapshot, lambda: self.vehicle.time_s, config.system_id)
-        onboard = (config.onboard_port + ONBOARD_PORT_OFFSET, config.onboard_port)
-        ground = (config.gcs_port + GROUND_PORT_OFFSET + config.system_id - 1, config.gcs_port) if config.gcs_port else None
-        self.server = MavlinkServer(pilot, frame, self.telemetry, onboard, ground)
+        links = open_links(link_plan(config.onboard_port, config.gcs_port, config.links), self.telemetry.now_s, config)
+        self.server = MavlinkServer(pilot, frame, self.telemetry, links=links)
         self.incidents = connect_faults(self.vehicle, self.server, self.telemetry, config.seed)
         for fault in config.faults:
             self.vehicle.simulation.inject(fault)
         self.carry: Callable[[float], tuple[Point, float]] | None = None
         self.alter_scan: Callable[[NDArray[np.float32]], NDArray[np.float32] | None] | None = None
-        self.lidar = ScipServer(lambda: self.device_time_s, config.lidar_port)
         self.pace = Pace(config.speed, time.monotonic())
         self._told_s = 0.0
         self._started_s = math.nan
-        self._scans = 0
         self._was_armed = False
         self._ended: str | None = None
         try:
-            self.lidar.start()
-            self.serial_lidar = SerialLidar(config.serial_lidar, config.serial_link, config.seed) if config.serial_lidar else None
+            kinds = (config.lidar_port, config.serial_lidar, config.serial_link, config.seed)
+            self.lidars = LidarDevices(self.vehicle.simulation, lambda: self.device_time_s, *kinds)
         except Exception:
-            self.lidar.stop()
             self.server.close()
             raise
+        self.lidar, self.serial_lidar = self.lidars.scip, self.lidars.serial
 
     def __enter__(self) -> Gateway:
         return self
@@ -142,9 +141,7 @@ class Gateway:
 
     def close(self) -> None:
         """Free all ports."""
-        self.lidar.stop()
-        if self.serial_lidar is not None:
-            self.serial_lidar.close()
+        self.lidars.close()
         self.server.close()
 
     def ready_message(self) -> dict[str, Any]:
@@ -155,8 +152,8 @@ class Gateway:
             "system_id": config.system_id,
             "onboard_port": config.onboard_port,
             "gcs_port": config.gcs_port,
-            "lidar_port": self.lidar.port,
-            "serial_lidar": self.serial_lidar.path if self.serial_lidar is not None else None,
+            "links": ready_links(self.server.links),
+            **self.lidars.ready_message(),
             "start": list(world.start),
             "start_yaw_rad": world.start_yaw_rad,
             "goal": list(world.goal),
@@ -193,22 +190,11 @@ class Gateway:
             vehicle.simulation.carry(*self.carry(vehicle.time_s))
         vehicle.advance(1)
         self.recorder.watch()
-        ahead_s = self.device_time_s - vehicle.time_s
-        if self.serial_lidar is not None:
-            self.serial_lidar.advance(vehicle.simulation, ahead_s)
-        if vehicle.simulation.steps >= step_at(self._scans * 0.05):
-            self._scans += 1
-            for scan in vehicle.simulation.device_scans():
-                self._publish(scan, ahead_s)
+        for scan in self.lidars.step(self.alter_scan):
+            self.telemetry.scan = scan
         self.incidents.step()
         self.server.poll()
         self._note_changes()
-
-    def _publish(self, scan: Scan, ahead_s: float) -> None:
-        ranges = self.alter_scan(scan.ranges_m) if self.alter_scan is not None else scan.ranges_m
-        if ranges is not None:
-            self.lidar.publish(scan.time_s + ahead_s, ranges)
-            self.telemetry.scan = replace(scan, ranges_m=ranges)
 
     def give_up(self, error: DynamicsError) -> None:
         """The vehicle can no longer be simulated: the report will say why."""
@@ -239,10 +225,7 @@ class Gateway:
             {"kind": item.kind, "begin_s": round(item.begin_s, 3), "end_s": item.end_s if math.isfinite(item.end_s) else None}
             for item in self.vehicle.simulation.faults.placed
         ]
-        try:
-            write_json_atomically(self.config.report, content)
-        except OSError as error:
-            _log.error("the report %s cannot be written: %s", self.config.report, error.strerror)
+        write_report(self.config.report, content)
 
     def _received(self) -> list[dict[str, Any]]:
         """What moved, armed or configured the vehicle came over the wire: kind, sender, how often, first and last time."""
@@ -261,32 +244,15 @@ class Gateway:
         return {"columns": ["t", "north", "east", "down", "yaw_rate", "system", "component"], "rows": rows}
 
     def _facts(self) -> dict[str, Any]:
-        world, config = self.world, self.config
+        config = self.config
         return {
-            "world": world.name,
-            "world_seed": world.seed,
+            **world_facts(self.world),
             "seed": config.seed,
             "system_id": config.system_id,
             "dynamics": config.dynamics,
             "vehicle": config.vehicle,
             "estimate": config.estimate,
             "wind_m_s": list(config.wind_m_s),
-            "size_m": [world.length_m, world.width_m, world.height_m],
-            "start": list(world.start),
-            "start_yaw_rad": world.start_yaw_rad,
-            "goal": list(world.goal),
-            "boxes": world.static_boxes.tolist(),
-            "movers": [
-                {
-                    "size_m": list(mover.size_m),
-                    "x_m": mover.x_m,
-                    "z_m": mover.z_m,
-                    "y_m": [mover.y_low_m, mover.y_high_m],
-                    "speed_m_s": mover.speed_m_s,
-                    "phase_m": mover.phase_m,
-                }
-                for mover in world.movers
-            ],
         }
 
 
@@ -325,7 +291,7 @@ def _wait(gateways: Sequence[Gateway], seconds: float) -> None:
     """Sleep until the next step is due; what arrives meanwhile is handled at once."""
     if seconds <= 0.0:
         return
-    owners = {link.socket: gateway for gateway in gateways for link in gateway.server.links if isinstance(link, UdpLink)}
+    owners = {watched: gateway for gateway in gateways for link in gateway.server.links for watched in link.watched()}
     readable, _, _ = select.select(list(owners), [], [], min(seconds, _LONGEST_WAIT_S))
     for gateway in {owners[sock] for sock in readable}:
         gateway.server.poll()

@@ -1,6 +1,6 @@
-"""The vehicle's side of a MAVLink link: what it streams, whom it answers, what arrives. UDP on loopback, or in memory.
+"""The vehicle's side of a MAVLink link: what it streams, whom it answers, what arrives. UDP or in memory; others: `stream_links`.
 
-Nothing blocks; everything that could grow is bounded. Link faults act here, on whole messages.
+Nothing blocks; everything that could grow is bounded. The link's quality and link faults act here, on whole messages.
 """
 
 from __future__ import annotations
@@ -13,16 +13,18 @@ import socket
 import struct
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.autopilot import StatusText
+from sim_gateway.link_conditions import LinkConditions
 from sim_gateway.link_faults import Garbage, LinkFaults
+from sim_gateway.link_spec import LOOPBACK
 from sim_gateway.mavlink_frame import FramePacker
 from sim_gateway.telemetry import COMPONENT_ID, STREAM_RATES_HZ, SYSTEM_ID, Message
 
-LOOPBACK = "127.0.0.1"
+_ANY_ADDRESS = "0.0.0.0"
 _MAX_DATAGRAM = 4096
 _DATAGRAMS_PER_POLL = 100  # more wait in the socket's own, bounded, buffer
 _PEERS_PER_LINK = 8
@@ -40,11 +42,11 @@ class PortInUseError(OSError):
     """A port the gateway needs is taken; the message names it."""
 
 
-def _bind(port: int, purpose: str) -> socket.socket:
+def _bind(host: str, port: int, purpose: str) -> socket.socket:
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setblocking(False)
     try:
-        sock.bind((LOOPBACK, port))
+        sock.bind((host, port))
     except OSError as error:
         sock.close()
         reason = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
@@ -58,6 +60,7 @@ class MavlinkLink(ABC):
     def __init__(self, name: str, column: int, now_s: Callable[[], float]) -> None:
         self.name = name
         self.faults: LinkFaults | None = None
+        self.conditions: LinkConditions | None = None
         self._now_s = now_s
         self._defaults = {n: 1.0 / rates[column] for n, rates in STREAM_RATES_HZ.items() if rates[column] > 0}
         self.streams = dict(self._defaults)  # name: interval, s
@@ -71,23 +74,47 @@ class MavlinkLink(ABC):
         """Whether a ground station's heartbeat came lately: only then PX4 sends STATUSTEXT here."""
         return self._now_s() - self.gcs_heard_s < _GCS_TIMEOUT_S
 
+    @property
+    def has_room(self) -> bool:
+        """Whether streams and parameters may be sent now: a slow line takes them as it gets them off."""
+        return True
+
+    @property
+    def limited(self) -> bool:
+        """Whether there may be no room."""
+        return False
+
+    def watched(self) -> list[socket.socket]:
+        """What becomes readable when something arrives."""
+        return []
+
     def close(self) -> None:  # noqa: B027  (most links hold nothing)
         """Let go of what carries the messages."""
 
     # ---- out
 
     def send(self, message: Message) -> None:
-        """Send to everyone on the link, through its faults."""
+        """Send to everyone on the link, through its faults and as well as its quality allows."""
         if self.faults is None:
-            self._transmit(message)
+            self._convey(message)
             return
         for leaving in self.faults.out(message, self._now_s()):
+            self._convey(leaving)
+
+    def _convey(self, message: Message | Garbage) -> None:
+        if self.conditions is None:
+            self._transmit(message)
+            return
+        for leaving in self.conditions.out(message, self._now_s()):
             self._transmit(leaving)
 
     def flush(self) -> None:
-        """Send what link faults have kept back until now, or add by themselves."""
+        """Send what was kept back until now, and what link faults add by themselves."""
         if self.faults is not None:
             for leaving in self.faults.due_out(self._now_s()):
+                self._convey(leaving)
+        if self.conditions is not None:
+            for leaving in self.conditions.due_out(self._now_s()):
                 self._transmit(leaving)
 
     @abstractmethod
@@ -119,29 +146,32 @@ class MavlinkLink(ABC):
         """The interval in force; -1 when the message is not streamed."""
         return round(self.streams[name] * 1e6) if name in self.streams else -1
 
-    def due(self, available: Callable[[str], bool]) -> list[str]:
-        """Names of the messages whose time has come. A stream that fell behind skips what it missed."""
+    def due(self, available: Callable[[str], bool]) -> Iterator[str]:
+        """Names of the messages whose time has come, the longest waiting first, as long as there is room on the link.
+
+        A stream that fell behind by more than its interval skips what it missed.
+        """
         now_s, queue = self._now_s(), self._queue
-        names: list[str] = []
         again: list[tuple[float, str, float]] = []
-        while queue and queue[0][0] <= now_s + 1e-9:
+        while queue and queue[0][0] <= now_s + 1e-9 and self.has_room:
             _, name, due_s = heapq.heappop(queue)
-            if available(name):
-                names.append(name)
-                behind = now_s - due_s > self.streams[name]
-                next_s = (now_s if behind else due_s) + self.streams[name]
-                again.append((next_s, name, next_s))
-            else:
+            if not available(name):
                 again.append((now_s + _LOOK_AGAIN_S, name, due_s))
+                continue
+            yield name
+            behind = now_s - due_s > self.streams[name]
+            next_s = (now_s if behind else due_s) + self.streams[name]
+            again.append((next_s, name, next_s))
         for entry in again:
             heapq.heappush(queue, entry)
-        return names
 
     # ---- in
 
     def receive(self) -> list[Message]:
-        """The valid messages that have arrived, through the link's faults."""
+        """The valid messages that have arrived, as well as the link's quality allows and through its faults."""
         arrived = self._fetch()
+        if self.conditions is not None:
+            arrived = self.conditions.into(arrived, self._now_s())
         return arrived if self.faults is None else self.faults.into(arrived, self._now_s())
 
     @abstractmethod
@@ -150,16 +180,30 @@ class MavlinkLink(ABC):
 
 
 class UdpLink(MavlinkLink):
-    """A UDP link on loopback: to its default client port and to every loopback address that has spoken to it lately."""
+    """A UDP link: to its default client and to every loopback address that has spoken to it lately.
+
+    Nobody else is heard: from other machines only the default client, `host`, and only if that is not on this one.
+    """
 
     def __init__(
-        self, name: str, own_port: int, client_port: int, column: int, now_s: Callable[[], float], system_id: int = SYSTEM_ID
+        self,
+        name: str,
+        own_port: int,
+        client_port: int,
+        column: int,
+        now_s: Callable[[], float],
+        system_id: int = SYSTEM_ID,
+        host: str = LOOPBACK,
     ) -> None:
         super().__init__(name, column, now_s)
-        self.socket = _bind(own_port, f"{name} link")
-        self._client = (LOOPBACK, client_port)
+        self.socket = _bind(LOOPBACK if _is_loopback(host) else _ANY_ADDRESS, own_port, f"{name} link")
+        self._client = (host, client_port)
         self._peers: dict[tuple[str, int], float] = {}
         self._packer = FramePacker(system_id, COMPONENT_ID)
+
+    def watched(self) -> list[socket.socket]:
+        """See `MavlinkLink.watched`."""
+        return [self.socket]
 
     def close(self) -> None:
         """Free the port."""
@@ -190,16 +234,19 @@ class UdpLink(MavlinkLink):
             except OSError as error:
                 _log.debug("receiving on the %s link: %s", self.name, error)
                 continue
-            found = _parse(data)
+            found = _parse(data) if self._is_heard(peer[0]) else []
             if found:
                 self._remember(peer)
             messages.extend(found)
         return messages
 
+    def _is_heard(self, address: str) -> bool:
+        return _is_loopback(address) or address == self._client[0]
+
     def _remember(self, peer: tuple[str, int]) -> None:
         """Answer a client on another port too, for as long as it speaks."""
         known = peer in self._peers or len(self._peers) < _PEERS_PER_LINK
-        if peer != self._client and known and peer[0].startswith("127."):
+        if peer != self._client and known and _is_loopback(peer[0]):
             self._peers[peer] = self._now_s()
 
     def _forget_silent_peers(self) -> None:
@@ -223,6 +270,10 @@ class MemoryLink(MavlinkLink):
         arrived = list(self.inbox)
         self.inbox.clear()
         return arrived
+
+
+def _is_loopback(address: str) -> bool:
+    return address.startswith("127.")
 
 
 def _parse(data: bytes) -> list[Message]:

@@ -126,7 +126,8 @@ class MavlinkServer:
             for name in link.due(self._telemetry.available):
                 link.send(self._telemetry.build(name))
             for _ in range(min(_PARAMS_PER_POLL, len(link.parameter_queue))):
-                self._send_parameter(link.parameter_queue.popleft(), link)
+                if link.has_room:
+                    self._send_parameter(link.parameter_queue.popleft(), link)
             link.flush()
 
     def _send_changes(self) -> None:

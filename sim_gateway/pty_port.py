@@ -30,22 +30,23 @@ class PtyPort:
                 link.unlink()
             link.symlink_to(self.path)
 
-    def read(self) -> bytes:
-        """What a client has sent since the last call."""
+    def read(self, most: int = _READ_BYTES) -> bytes:
+        """What a client has sent since the last call, up to `most` bytes."""
         try:
-            return os.read(self._ours, _READ_BYTES)
+            return os.read(self._ours, most) if most > 0 else b""
         except BlockingIOError:
             return b""
 
-    def write(self, data: bytes) -> None:
-        """Send, or lose what the line cannot take."""
+    def write(self, data: bytes) -> int:
+        """Send, or lose what the line cannot take: all of it is done with."""
         if not data:
-            return
+            return 0
         try:
             written = os.write(self._ours, data)
         except BlockingIOError:
             written = 0
         self.lost_bytes += len(data) - written
+        return len(data)
 
     def wait(self, timeout_s: float) -> bool:
         """Whether a client has sent something within `timeout_s`."""

@@ -38,15 +38,16 @@ class SerialLidar:
         self.port = PtyPort(link)
         self.path = self.port.path
 
-    def advance(self, simulation: Simulation, ahead_s: float = 0.0) -> None:
-        """Answer the client and send what the beams fired since the last call have seen.
+    def advance(self, simulation: Simulation, ahead_s: float = 0.0, *, seeing: bool = True) -> None:
+        """Answer the client and send what the beams fired since the last call have seen, if it is `seeing` anything.
 
         `ahead_s`: the device's clock less vehicle time.
         """
         heard = self.port.read()
         answers = self.device.handle(heard) if heard else b""
         shots = self.scanner.fire(simulation)
-        self.port.write(answers + self.device.take(replace(shots, time_s=shots.time_s + ahead_s)))
+        measured = self.device.take(replace(shots, time_s=shots.time_s + ahead_s)) if seeing else b""
+        self.port.write(answers + measured)
 
     def close(self) -> None:
         """Take the line away."""

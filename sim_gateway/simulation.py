@@ -19,7 +19,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sim_gateway.collision import clearance_m
-from sim_gateway.dynamics import CONTACTS, FLOWN, LEAST_CLEARANCE, NORMALS, Course, Demand, make_dynamics, watch_clearance
+from sim_gateway.dynamics import (
+    CONTACTS,
+    FLOWN,
+    LEAST_CLEARANCE,
+    NORMALS,
+    Course,
+    Demand,
+    Dynamics,
+    make_dynamics,
+    watch_clearance,
+)
 from sim_gateway.estimate import (
     ACCELERATION_SIGMA,
     ATTITUDE_ERROR,
@@ -159,7 +169,8 @@ class Simulation:
         seed: of everything random here (the world has its own).
         hover_height_m: None starts on the ground with motors off; a number starts hovering there above the start.
         contact_radius_m: radius of the sphere whose distance to boxes is the clearance.
-        dynamics: what moves the airframe, a name of `dynamics.DYNAMICS`. Raises `DynamicsMissingError` if it is not installed.
+        dynamics: what moves the airframe: a name of `dynamics.DYNAMICS` (raises `DynamicsMissingError` if it is not installed),
+            or an object that does.
     """
 
     def __init__(
@@ -173,7 +184,7 @@ class Simulation:
         *,
         hover_height_m: float | None = None,
         contact_radius_m: float = 0.35,
-        dynamics: str = "internal",
+        dynamics: str | Dynamics = "internal",
     ) -> None:
         params, wind = params or VehicleParams(), wind or WindConfig()
         self.world, self.seed, self.steps, self.contact_radius_m = world, seed, 0, contact_radius_m
@@ -193,7 +204,7 @@ class Simulation:
         self._scan_faults = ScanFaults(self.faults, seed)
         self._log = np.array([math.inf, 0.0, 0.0, 0.0])
         watch_clearance(self._boxes, self._state, contact_radius_m, self._log)
-        self._dynamics = make_dynamics(dynamics, params)
+        self._dynamics = make_dynamics(dynamics, params) if isinstance(dynamics, str) else dynamics
         self._course = Course(
             *(self._state, self._boxes, len(world.static_boxes), world.mover_rows, self._error, self._coefficients),
             *(self._gust, self._gust_coefficients, contact_radius_m, self._log),

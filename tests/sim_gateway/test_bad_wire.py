@@ -19,7 +19,8 @@ from mavlink_bench import Client, free_port
 from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.corridor import CorridorConfig, generate_corridor
-from sim_gateway.gateway import ONBOARD_PORT_OFFSET, Gateway, GatewayConfig, warm_up
+from sim_gateway.gateway import Gateway, GatewayConfig, warm_up
+from sim_gateway.open_links import ONBOARD_PORT_OFFSET
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(60)]
 

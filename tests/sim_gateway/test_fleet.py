@@ -17,8 +17,9 @@ from pymavlink.dialects.v20 import development as mav
 from sim_gateway.corridor import CorridorConfig, generate_corridor
 from sim_gateway.errors import DivergedError
 from sim_gateway.fleet import SPACING_M, Fleet, NoRoomError, start_places
-from sim_gateway.gateway import ONBOARD_PORT_OFFSET, GatewayConfig
+from sim_gateway.gateway import GatewayConfig
 from sim_gateway.mavlink_links import PortInUseError
+from sim_gateway.open_links import ONBOARD_PORT_OFFSET
 from sim_gateway.scene import World
 
 WORLD = generate_corridor(1, CorridorConfig())

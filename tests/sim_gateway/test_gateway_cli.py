@@ -17,8 +17,9 @@ import pytest
 from pymavlink.dialects.v20 import development as mav
 from typer.testing import CliRunner
 
-from sim_gateway.cli import app, main
+from sim_gateway.cli import app, completed, main
 from sim_gateway.flight_report import FlightRecorder, write_json_atomically
+from tests.sim_gateway.px4_stand_in import StandIn
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -166,6 +167,50 @@ def test_speed_and_max_time(world: Path, tmp_path: Path) -> None:
     assert truth["real_time_factor"] == pytest.approx(4.0, rel=0.15)
 
 
+@pytest.mark.realtime
+def test_simulator_of_px4_ends_when_px4_has_gone(world: Path, tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    with _started(world, "--px4", "tcp:0", "--speed", "0", "--report", str(report)) as (child, ready, _port):
+        px4 = StandIn(int(ready["px4"].removeprefix("tcp:")))
+        px4.start()
+        px4.fly(0.2)
+        px4.close()
+        assert _ends(child, 5.0) == 0
+    assert json.loads(report.read_text())["answered_steps"] in (49, 50)
+
+
+@pytest.mark.realtime
+def test_follower_and_links_from_the_command_line(world: Path, tmp_path: Path) -> None:
+    link = f"pty:{tmp_path / 'mavlink'},baud=115200"
+    with _started(world, "--link", link) as (_, ready, port):
+        assert ready["links"] == [f"serial:{os.path.realpath(tmp_path / 'mavlink')}"]
+        with _started(world, "--follow", f"udpout://127.0.0.1:{port + 40}", "--origin", "2,0,0") as (_child, follower, _):
+            assert (follower["origin"], follower["start"]) == ([2.0, 0.0, 0.0], [2.0, 0.0, 0.0])
+            with socket.create_connection(("127.0.0.1", follower["lidar_port"]), timeout=10) as lidar:
+                lidar.sendall(b"MD0360036000001\n")
+                heard = b""
+                while b"\n99b\n" not in heard:
+                    heard += lidar.recv(4096)
+
+
+@pytest.mark.parametrize(
+    ("options", "word"), [(["--px4", "tcp:x"], "tcp:4560"), (["--follow", "ftp://127.0.0.1:1"], "udpin://127.0.0.1:14551")]
+)
+def test_places_that_cannot_be_opened_are_one_line_and_exit_2(world: Path, options: list[str], word: str) -> None:
+    command = [sys.executable, "-m", "sim_gateway", "--world", str(world), *options]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=50, stdin=subprocess.DEVNULL, check=False)
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert word in line
+
+
+def test_px4_alone_means_its_usual_port() -> None:
+    usual = ["--px4", "tcp:4560"]
+    assert completed(["--world", "w", "--px4"]) == ["--world", "w", *usual]
+    assert completed(["--px4", "--world", "w"]) == [*usual, "--world", "w"]
+    assert completed(["--px4", "tcp:4570"]) == ["--px4", "tcp:4570"]
+
+
 @pytest.mark.parametrize("which", ["udp", "tcp"])
 def test_port_in_use_is_one_line_and_exit_2(world: Path, which: str) -> None:
     port, lidar = _free_ports()
@@ -197,6 +242,12 @@ def test_port_in_use_is_one_line_and_exit_2(world: Path, which: str) -> None:
         (["--speed", "nan"], "--speed"),
         (["--dynamics", "magic"], "internal"),
         (["--no-such-option"], "--no-such-option"),
+        (["--link", "udp:0"], "--link"),
+        (["--link", "serial:/dev/ttyUSB0"], "baud=57600"),
+        (["--speed", "0"], "--px4"),
+        (["--no-gps"], "--px4"),
+        (["--follow", "udpin://127.0.0.1:14551", "--speed", "2"], "--speed"),
+        (["--follow", "udpin://127.0.0.1:14551", "--origin", "1,2"], "--origin"),
     ],
 )
 def test_bad_options_are_one_line_and_exit_2(
