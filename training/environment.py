@@ -96,10 +96,7 @@ class CorridorVectorEnv(VectorEnv):
         self, actions: NDArray[np.float32], hold: int
     ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """One decision held for ``hold`` ticks (turned by the new yaw at every tick). Raises ValueError on NaN actions."""
-        clipped = np.clip(np.asarray(actions, dtype=np.float64), self._low, self._high)
-        if not np.isfinite(clipped).all():
-            raise ValueError("actions hold NaN")
-        kernels.step_all(self.arena, self.rules, clipped, hold, self.rng, self._observations, self._rewards)
+        self.decide(actions, hold)
         outcome = np.where(self.arena.active, self.arena.outcome, kernels.RUNNING)
         truncated = outcome == kernels.TIME_OUT
         terminated = (outcome != kernels.RUNNING) & ~truncated
@@ -107,6 +104,13 @@ class CorridorVectorEnv(VectorEnv):
         for i in np.flatnonzero(outcome):
             self._begin(int(i))
         return self._observations.copy(), self._rewards.copy(), terminated, truncated, info
+
+    def decide(self, actions: NDArray[np.floating[Any]], hold: int) -> None:
+        """`step_held` without its answer and without new episodes: the state is then in ``arena``. Raises ValueError on NaN."""
+        clipped = np.clip(np.asarray(actions, dtype=np.float64), self._low, self._high)
+        if not np.isfinite(clipped).all():
+            raise ValueError("actions hold NaN")
+        kernels.step_all(self.arena, self.rules, clipped, hold, self.rng, self._observations, self._rewards)
 
     def _episode_info(self, outcome: NDArray[np.int64]) -> dict[str, Any]:
         arena, ended = self.arena, np.flatnonzero(outcome)
