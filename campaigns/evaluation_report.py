@@ -15,7 +15,7 @@ def markdown(reports: list[dict[str, Any]]) -> str:
 
 def overview(reports: list[dict[str, Any]]) -> str:
     """One row per evaluation."""
-    head = "policy | split | dynamics | safety | clean success | success | collisions per episode | path efficiency | mean jerk, m/s3"
+    head = "policy | split | dynamics | safety | clean success | success | collisions | path efficiency | mean jerk, m/s3"
     rows = [
         " | ".join(
             (

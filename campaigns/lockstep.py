@@ -203,7 +203,7 @@ class LockstepFlight:
 
 
 def what_was_hit(boxes: NDArray[np.float64], fixed: int, position_m: tuple[float, float, float], radius_m: float) -> str:
-    """The failure's name for a contact at `position_m`: of the nearest of `boxes` [m, 6], the first `fixed` of which stand still."""
+    """The failure's name for a contact at `position_m`: the nearest of `boxes` [m, 6], the first `fixed` of which stand still."""
     position = np.array(position_m)
     nearest = min(range(len(boxes)), key=lambda i: clearance_m(boxes[i : i + 1], position, radius_m))
     if nearest >= fixed:

@@ -72,7 +72,7 @@ def load_split(name: str, file: Path = DEFAULT_FILE) -> Split:
 
 
 def load_splits(names: list[str], file: Path = DEFAULT_FILE) -> dict[str, Split]:
-    """The splits of these names, in this order; `all` stands for every one. Raises `ConfigError` that lists the names there are."""
+    """The splits of these names, in this order; `all` is every one. Raises `ConfigError` that lists the names there are."""
     splits = load_config(file, Splits).splits
     for name in names:
         if name not in splits and name != ALL:

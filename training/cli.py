@@ -39,6 +39,7 @@ def train(
     resume: Annotated[Path | None, typer.Option(help="Go on with the run in this folder, from its last.pt.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Replaces the preset's seed.")] = None,
     decisions: Annotated[float | None, typer.Option(min=1, help="Replaces the preset's number of decisions.")] = None,
+    memory: Annotated[str | None, typer.Option(help="Replaces the preset's memory: lstm, gru, stack or none.")] = None,
     device: Annotated[str, typer.Option(help="Torch device of the network.")] = "cpu",
     threads: Annotated[int, typer.Option(min=1, help="Torch threads; more than 1 rarely helps at this size.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object with the result on stdout.")] = False,
@@ -53,7 +54,8 @@ def train(
     from training.ppo import TrainingDivergedError
 
     try:
-        result = _run(config, out, resume, {"seed": seed, "decisions": decisions and int(decisions)}, device, threads)
+        changes = {"seed": seed, "decisions": decisions and int(decisions), "memory": memory}
+        result = _run(config, out, resume, changes, device, threads)
     except (_UsageError, ConfigError, CheckpointError) as error:
         _fail(str(error), 2)
     except KeyboardInterrupt:
@@ -106,14 +108,16 @@ def _settings(config: Path | None, out: Path | None, resume: Path | None, change
             raise _UsageError(f"{folder} already holds a run: go on with --resume {folder}, or give another --out")
     else:
         assert resume is not None
-        if changes["seed"] is not None:
-            raise _UsageError("--seed belongs to a new run; a resumed one keeps its own")
+        for name in ("seed", "memory"):
+            if changes[name] is not None:
+                raise _UsageError(f"--{name} belongs to a new run; a resumed one keeps its own")
         base, folder = _stored_config(load_checkpoint(resume / "last.pt", resume=True), resume), out or resume
     try:
         merged = base.model_dump() | {key: value for key, value in changes.items() if value is not None}
         return TrainingConfig.model_validate(merged), folder
     except ValidationError as error:
-        raise _UsageError(str(error.errors()[0]["msg"])) from None
+        first = error.errors()[0]
+        raise _UsageError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
 def _stored_config(content: dict[str, Any], folder: Path) -> TrainingConfig:

@@ -142,7 +142,7 @@ class TrainingConfig(StrictModel):
     checkpoint_every_updates: int = Field(default=10, ge=1)
     environment: EnvironmentConfig = EnvironmentConfig()
     network: dict[str, Any] = Field(default_factory=dict, description="overrides of policy_export.network.NetworkConfig")
-    memory: Literal["lstm", "none"] = "lstm"
+    memory: Literal["lstm", "gru", "stack", "none"] = "lstm"
     layout: Literal["default", "paper"] = "default"
     ppo: PpoConfig = PpoConfig()
     evaluation: EvaluationConfig = EvaluationConfig()

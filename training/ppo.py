@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from policy_export.lstm_sequence import lstm_sequence
 from policy_export.network import PolicyNetwork
 from training.config import PpoConfig
 
@@ -97,9 +96,7 @@ class Batch:
 
 def evaluate_sequences(network: PolicyNetwork, features: Tensor, h0: Tensor, c0: Tensor, reset: Tensor) -> tuple[Tensor, Tensor]:
     """Means [T, B, 4] and values [T, B] of whole sequences of features, with gradients."""
-    if network.lstm is None:
-        return network.heads(network.encode(features), features)
-    memory, _ = lstm_sequence(features, network.lstm_weights(), (h0, c0), reset)
+    memory, _, _ = network.memory.sequence(features, h0, c0, reset)
     return network.heads(memory, features)
 
 

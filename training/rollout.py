@@ -103,11 +103,9 @@ class RolloutCollector:
 
     def _forward(self, features: Tensor, keep: Tensor) -> tuple[Tensor, Tensor]:
         network = self.network
-        if network.lstm is None:
-            return network.heads(network.encode(features), features)
-        h, c = network.cell(features, self.h[0] * keep, self.c[0] * keep)
+        memory, h, c = network.memory.step(features, self.h[0] * keep, self.c[0] * keep)
         self.h, self.c = h.unsqueeze(0), c.unsqueeze(0)
-        return network.heads(h, features)
+        return network.heads(memory, features)
 
     def _value(self, observation: Tensor, index: Tensor, keep_reset: bool) -> Tensor:
         """Value of ``observation`` [K, 190] seen next by the environments ``index`` [K], without advancing their state."""

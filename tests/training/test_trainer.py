@@ -22,7 +22,7 @@ from training.checkpoint import CheckpointError, load_checkpoint, save_checkpoin
 from training.config import EvaluationConfig, PpoConfig, TrainingConfig
 from training.evaluation import evaluate, evaluation_environment
 from training.intervals import wilson_interval
-from training.ppo import correlated_log_prob, evaluate_sequences
+from training.ppo import advantages, correlated_log_prob, evaluate_sequences
 from training.trainer import Trainer, hold_ticks, layouts
 
 ROOT = Path(__file__).parents[2]
@@ -65,7 +65,7 @@ def test_presets_load_and_make_a_network(path):
     assert trainer.network.config.action_low == action.low
 
 
-@pytest.mark.parametrize("memory", ["lstm", "none"])
+@pytest.mark.parametrize("memory", ["lstm", "gru", "stack", "none"])
 def test_the_learner_sees_what_the_rollout_did(tmp_path, memory):
     trainer = Trainer(tiny(memory=memory), tmp_path)
     resets = 0
@@ -79,6 +79,42 @@ def test_the_learner_sees_what_the_rollout_did(tmp_path, memory):
         assert summary.decisions == UPDATE
         resets += int(batch.reset[1:].sum())
     assert resets > 0  # three-second episodes end inside the rollouts
+
+
+def test_values_beyond_the_rollout_and_beyond_a_time_out_use_the_state_that_led_there(tmp_path, monkeypatch):
+    """Replays every environment's flight by itself, one step at a time, and values what it saw last."""
+    trainer = Trainer(tiny(environment={"world_pool": 4, "time_limit_s": 0.4}), tmp_path)
+    collector, network, seen = trainer.collector, trainer.network, []
+    step_held = trainer.env.step_held
+
+    def watched(actions, hold):
+        result = step_held(actions, hold)
+        seen.append((result[0].copy(), result[3].copy(), result[4].get("final_obs")))
+        return result
+
+    monkeypatch.setattr(trainer.env, "step_held", watched)
+    first = collector.observation.clone()
+    given = {}
+
+    def spy(rewards, values, last_value, terminated, truncated, final_values, decay):
+        given.update(last=last_value, truncated=truncated, final=final_values)
+        return advantages(rewards, values, last_value, terminated, truncated, final_values, decay)
+
+    monkeypatch.setattr("training.rollout.advantages", spy)
+    collector.collect(1)
+    assert given["truncated"].sum() > 0
+    with torch.no_grad():
+        for b in range(8):
+            h, c = network.initial_state(1)
+            observation = first[b : b + 1]
+            for t, (following, truncated, final) in enumerate(seen):
+                _, _, h, c = network.step(observation, h, c)
+                if truncated[b]:
+                    value = network.step(torch.from_numpy(final[b : b + 1]), h, c)[1]
+                    torch.testing.assert_close(given["final"][t, b], value[0], atol=1e-5, rtol=1e-5)
+                    h, c = network.initial_state(1)
+                observation = torch.from_numpy(following[b : b + 1])
+            torch.testing.assert_close(given["last"][b], network.step(observation, h, c)[1][0], atol=1e-5, rtol=1e-5)
 
 
 def test_same_seed_same_weights_another_seed_others(tmp_path):
