@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
@@ -13,6 +14,7 @@ from campaigns.errors import ClusterError
 Result = TypeVar("Result")
 # Each task of a cluster computes this many indices: fewer round trips, and still many tasks per core.
 RAY_CHUNK = 4
+CONNECT_TIMEOUT_S = 5.0
 
 
 def over_processes(function: Callable[[int], Result], count: int, workers: int | None = None) -> Iterator[tuple[int, Result]]:
@@ -49,10 +51,13 @@ def _connect(address: str):  # type: ignore[no-untyped-def]  # the module itself
         import ray  # noqa: PLC0415  # an extra
     except ImportError:
         raise ClusterError("--ray needs the extra `cluster`: pip install -c constraints.txt '.[cluster]'") from None
+    host, _, port = address.rpartition(":")
     try:
+        # Ray itself waits for minutes where nothing answers.
+        socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S).close()
         ray.init(address=address, log_to_driver=False, logging_level="error")
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise ClusterError(f"no Ray cluster at {address}: {str(error).splitlines()[0]}") from None
+    except (OSError, ValueError, RuntimeError) as error:
+        raise ClusterError(f"no Ray cluster at {address} (HOST:PORT): {str(error).splitlines()[0]}") from None
     return ray
 
 

@@ -84,7 +84,7 @@ class CorridorVectorEnv(VectorEnv):
         self.arena.active[:] = True
         for i in range(self.num_envs):
             self._begin(i)
-        return self._observations.copy(), {}
+        return self.last_observations, {}
 
     def step(
         self, actions: NDArray[np.float32]
@@ -103,7 +103,7 @@ class CorridorVectorEnv(VectorEnv):
         info = self._episode_info(outcome)
         for i in np.flatnonzero(outcome):
             self._begin(int(i))
-        return self._observations.copy(), self._rewards.copy(), terminated, truncated, info
+        return self.last_observations, self.last_rewards, terminated, truncated, info
 
     def decide(self, actions: NDArray[np.floating[Any]], hold: int) -> None:
         """`step_held` without its answer and without new episodes: the state is then in ``arena``. Raises ValueError on NaN."""
@@ -111,6 +111,16 @@ class CorridorVectorEnv(VectorEnv):
         if not np.isfinite(clipped).all():
             raise ValueError("actions hold NaN")
         kernels.step_all(self.arena, self.rules, clipped, hold, self.rng, self._observations, self._rewards)
+
+    @property
+    def last_observations(self) -> NDArray[np.float32]:
+        """A copy of the newest observations [N, 190]."""
+        return self._observations.copy()
+
+    @property
+    def last_rewards(self) -> NDArray[np.float64]:
+        """A copy of the rewards [N] of the last decision."""
+        return self._rewards.copy()
 
     def _episode_info(self, outcome: NDArray[np.int64]) -> dict[str, Any]:
         arena, ended = self.arena, np.flatnonzero(outcome)

@@ -46,6 +46,17 @@ class FixedWorlds:
         return self._worlds[environment % len(self._worlds)]
 
 
+class FreshWorlds:
+    """A new corridor from the training seeds for every episode."""
+
+    def __init__(self, config: EnvironmentConfig) -> None:
+        self._config = config
+
+    def next_world(self, environment: int, rng: np.random.Generator) -> World:
+        """See WorldSource."""
+        return world_for_seed(int(rng.integers(TRAINING_SEED_START, EVALUATION_SEED_START)), self._config)
+
+
 class WorldPool:
     """``world_pool`` corridors drawn from the training seeds; the oldest slot is replaced after every episode begun."""
 
