@@ -181,8 +181,12 @@ class PolicyNetwork(nn.Module):
 
     def heads(self, memory: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
         """Memory [..., H] and features [..., F] to means [..., 4] and values [...]."""
-        joined = torch.cat((memory, features), dim=-1) if self.config.feature_skip else memory
+        joined = self.join(memory, features)
         return self.policy_head(joined), self.value_head(joined).squeeze(-1)
+
+    def join(self, memory: Tensor, features: Tensor) -> Tensor:
+        """What both heads read: memory [..., H], with the features [..., F] beside it if the network is built so."""
+        return torch.cat((memory, features), dim=-1) if self.config.feature_skip else memory
 
     def step(self, obs: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """One decision for a batch: (mean [B, 4] before tanh, value [B], h', c' [1, B, H])."""

@@ -15,8 +15,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from policy_export.memory import LstmMemory
 from policy_export.network import PolicyNetwork
 from training.config import PpoConfig
+from training.fast_lstm import fast_lstm_sequence
 
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 # Beyond this |mean| a tanh is flat: means are pulled back so that gradients stay alive.
@@ -96,8 +98,12 @@ class Batch:
 
 def evaluate_sequences(network: PolicyNetwork, features: Tensor, h0: Tensor, c0: Tensor, reset: Tensor) -> tuple[Tensor, Tensor]:
     """Means [T, B, 4] and values [T, B] of whole sequences of features, with gradients."""
-    memory, _, _ = network.memory.sequence(features, h0, c0, reset)
-    return network.heads(memory, features)
+    memory = network.memory
+    if isinstance(memory, LstmMemory):
+        output, _, _ = fast_lstm_sequence(memory, features, h0, c0, reset)
+    else:
+        output, _, _ = memory.sequence(features, h0, c0, reset)
+    return network.heads(output, features)
 
 
 class PpoLearner:
@@ -107,7 +113,7 @@ class PpoLearner:
         self.network = network
         self.config = config
         self.learning_rate = config.learning_rate
-        self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, eps=1e-5)
+        self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, eps=1e-5, fused=True)
 
     def update(self, batch: Batch, generator: torch.Generator, progress: float) -> dict[str, float]:
         """All epochs over one rollout; ``progress`` 0..1 is the share of training done. Returns the mean of each metric.

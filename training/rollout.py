@@ -58,54 +58,46 @@ class RolloutCollector:
     @torch.no_grad()
     def collect(self, hold: int) -> tuple[Batch, RolloutSummary]:
         """One rollout with every action held for ``hold`` ticks. Fields of the batch are [T, B, ...]."""
-        steps, summary = self.config.steps, RolloutSummary()
+        network, summary = self.network, RolloutSummary()
         rho = self.config.noise_correlation_per_tick**hold
         h0, c0 = (self.h[0].clone(), self.c[0].clone())
-        rows: list[dict[str, Tensor]] = [self._decide(hold, rho, summary) for _ in range(steps)]
+        exploration = (rho, math.sqrt(1.0 - rho * rho), network.log_std.exp())
+        rows = [self._decide(hold, exploration, summary) for _ in range(self.config.steps)]
         stacked = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
-        values = stacked.pop("value")
+        values = network.value_head(stacked.pop("joined")).squeeze(-1)
+        log_prob = correlated_log_prob(
+            stacked["raw"], stacked.pop("mean"), network.log_std, stacked["noise_before"], torch.tensor(rho)
+        )
         last_value = self._value(self.observation, torch.arange(self.env.num_envs, device=self.device), keep_reset=True)
         decay = (self.config.gamma_per_tick**hold, self.config.gae_lambda)
-        advantage, target = advantages(
-            stacked.pop("reward"),
-            values,
-            last_value,
-            stacked.pop("terminated"),
-            stacked.pop("truncated"),
-            stacked.pop("final_value"),
-            decay,
-        )
-        return Batch(**stacked, advantage=advantage, target=target, h0=h0, c0=c0), summary
+        ends = (stacked.pop("terminated"), stacked.pop("truncated"), stacked.pop("final_value"))
+        advantage, target = advantages(stacked.pop("reward"), values, last_value, *ends, decay)
+        return Batch(
+            **stacked, log_prob=log_prob, rho=torch.full_like(log_prob, rho), advantage=advantage, target=target, h0=h0, c0=c0
+        ), summary
 
-    def _decide(self, hold: int, rho: float, summary: RolloutSummary) -> dict[str, Tensor]:
-        """One decision of every environment; advances all state."""
-        network = self.network
-        features = network.features(self.observation)
-        keep = (~self.reset).float().unsqueeze(-1)
-        mean, value = self._forward(features, keep)
-        noise_before = self.noise
-        correlation = torch.full((self.env.num_envs, 1), rho, device=self.device)
-        self.noise = rho * noise_before + math.sqrt(1.0 - rho * rho) * self._fresh_noise()
-        raw = mean + network.log_std.exp() * self.noise
-        log_prob = correlated_log_prob(raw, mean, network.log_std, noise_before, correlation)
-        action = network.action(raw)
-        observation, reward, terminated, truncated, info = self.env.step_held(action.cpu().numpy(), hold)
-        row = {"features": features, "raw": raw, "noise_before": noise_before, "rho": correlation[:, 0], "log_prob": log_prob}
-        row |= {"value": value, "reset": self.reset}
+    def _decide(self, hold: int, exploration: tuple[float, float, Tensor], summary: RolloutSummary) -> dict[str, Tensor]:
+        """One decision of every environment; advances all state. ``exploration``: correlation, fresh share, deviation."""
+        network, (rho, fresh, std) = self.network, exploration
+        features, reset, noise_before = network.features(self.observation), self.reset, self.noise
+        keep = (~reset).float().unsqueeze(-1)
+        memory, h, c = network.memory.step(features, self.h[0] * keep, self.c[0] * keep)
+        self.h, self.c = h.unsqueeze(0), c.unsqueeze(0)
+        joined = network.join(memory, features)
+        mean = network.policy_head(joined)
+        self.noise = rho * noise_before + fresh * self._fresh_noise()
+        raw = mean + std * self.noise
+        observation, reward, terminated, truncated, info = self.env.step_held(network.action(raw).cpu().numpy(), hold)
+        row = {"features": features, "joined": joined, "mean": mean, "raw": raw, "noise_before": noise_before, "reset": reset}
         row |= {"reward": self._tensor(reward.astype(np.float32)), "terminated": self._tensor(terminated)}
         row["truncated"] = self._tensor(truncated)
         row["final_value"] = self._final_values(row["truncated"], info)
         self.observation = self._tensor(observation)
         self.reset = row["terminated"] | row["truncated"]
-        self.noise = torch.where(self.reset.unsqueeze(-1), self._fresh_noise(), self.noise)
+        if len(info["ended"]):
+            self.noise = torch.where(self.reset.unsqueeze(-1), self._fresh_noise(), self.noise)
         _summarise(summary, info, self.env.num_envs)
         return row
-
-    def _forward(self, features: Tensor, keep: Tensor) -> tuple[Tensor, Tensor]:
-        network = self.network
-        memory, h, c = network.memory.step(features, self.h[0] * keep, self.c[0] * keep)
-        self.h, self.c = h.unsqueeze(0), c.unsqueeze(0)
-        return network.heads(memory, features)
 
     def _value(self, observation: Tensor, index: Tensor, keep_reset: bool) -> Tensor:
         """Value of ``observation`` [K, 190] seen next by the environments ``index`` [K], without advancing their state."""
