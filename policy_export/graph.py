@@ -34,7 +34,9 @@ def build_model(network: PolicyNetwork, memory_form: MemoryForm = DEFAULT_MEMORY
     Raises `PolicyError` for a memory that a policy file cannot carry.
     """
     if network.config.memory == "stack":
-        raise PolicyError("memory `stack` is for comparison in training: a policy file carries lstm, gru or none; train one of these")
+        raise PolicyError(
+            "memory `stack` is for comparison in training: a policy file carries lstm, gru or none; train one of these"
+        )
     graph = GraphWriter()
     features = _features(graph, network)
     if network.lstm is not None:

@@ -13,7 +13,8 @@ import typer
 
 if TYPE_CHECKING:
     from training.config import TrainingConfig
-    from training.trainer import Status, Trainer
+    from training.recorder import Status
+    from training.trainer import Trainer
 
 _EPILOG = """
 Examples:
@@ -23,6 +24,8 @@ train-policy --config configs/training/ppo_lstm.yaml
 train-policy --config configs/training/ppo_lstm.yaml --out runs/night --seed 3 --decisions 5e6
 
 train-policy --resume runs/night
+
+torchrun --nproc-per-node 2 -m training.cli --config configs/training/ppo_lstm.yaml
 """
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
@@ -62,7 +65,7 @@ def train(
         _fail("stopped at once; the last checkpoint is good", 130)
     except TrainingDivergedError as error:
         _fail(f"training diverged: {error}; the last checkpoint is good", 1)
-    if as_json:
+    if as_json and result.pop("leads"):
         print(json.dumps(result))
 
 
@@ -81,17 +84,32 @@ def _run(
     torch.set_num_threads(threads)
     settings, folder = _settings(config, out, resume, changes)
     _check_device(device)
+    from training.team import join, leave
     from training.trainer import Trainer
 
-    trainer = Trainer(settings, folder, device)
-    if resume is not None:
-        trainer.resume(resume / "last.pt")
-    interrupted = _train(trainer)
-    print(f"{'stopped' if interrupted else 'done'}: {folder}/last.pt after {trainer.decisions:,} decisions", file=sys.stderr)
+    team, device = join(device)
+    _check_shares(settings, team.size)
+    try:
+        trainer = Trainer(settings, folder, device, team)
+        if resume is not None:
+            trainer.resume(resume / "last.pt")
+        interrupted = _train(trainer)
+    finally:
+        leave(team)
+    if team.leads:
+        print(f"{'stopped' if interrupted else 'done'}: {folder}/last.pt after {trainer.decisions:,} decisions", file=sys.stderr)
     return {
         "run": str(folder), "decisions": trainer.decisions, "seconds": round(trainer.seconds, 1), "finished": not interrupted,
-        "best_success": trainer.best if trainer.best >= 0.0 else None, "evaluation": trainer.evaluation,
+        "best_success": trainer.best if trainer.best >= 0.0 else None, "evaluation": trainer.evaluation, "leads": team.leads,
     }  # fmt: skip
+
+
+def _check_shares(settings: TrainingConfig, processes: int) -> None:
+    parts = processes * settings.ppo.minibatches
+    if settings.ppo.environments % parts:
+        raise _UsageError(
+            f"ppo.environments ({settings.ppo.environments}) must be a multiple of processes x minibatches ({parts})"
+        )
 
 
 def _settings(config: Path | None, out: Path | None, resume: Path | None, changes: dict[str, Any]) -> tuple[TrainingConfig, Path]:
@@ -148,13 +166,15 @@ def _train(trainer: Trainer) -> bool:
     console = Console(stderr=True)
     columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), TextColumn("ETA"), TimeRemainingColumn())
     stop = _StopRequest()
-    with Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=120.0) as progress, stop:
+    quiet = not (console.is_terminal and trainer.team.leads)
+    with Progress(*columns, console=console, disable=quiet, speed_estimate_period=120.0) as progress, stop:
         task = progress.add_task("starting", total=trainer.config.decisions, completed=trainer.decisions)
         for status in trainer.updates():
             progress.update(task, completed=status.decisions, description=_describe(status))
-            _log(console, trainer, status)
-            if stop.requested:
-                trainer.save("last.pt")
+            if trainer.team.leads:
+                _log(console, trainer, status)
+            if trainer.team.mean(stop.requested) > 0.0:  # all processes end at the same update
+                trainer.save()
                 break
     return trainer.decisions < trainer.config.decisions
 

@@ -139,7 +139,7 @@ class TrainingConfig(StrictModel):
 
     seed: int = Field(default=1, ge=0)
     decisions: int = Field(default=30_000_000, ge=1)
-    checkpoint_every_updates: int = Field(default=10, ge=1)
+    checkpoint_every_updates: int = Field(default=1, ge=1, description="a killed run loses at most so many updates")
     environment: EnvironmentConfig = EnvironmentConfig()
     network: dict[str, Any] = Field(default_factory=dict, description="overrides of policy_export.network.NetworkConfig")
     memory: Literal["lstm", "gru", "stack", "none"] = "lstm"

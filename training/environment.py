@@ -130,6 +130,7 @@ class CorridorVectorEnv(VectorEnv):
             "ended": ended,
             "outcomes": [kernels.OUTCOME_NAMES[outcome[i]] for i in ended],
             "episode_ticks": arena.ticks[ended].tolist(),
+            "episode_return": arena.episode[ended, kernels.RETURN].tolist(),
             "path_length_m": arena.episode[ended, kernels.PATH_LENGTH].tolist(),
             "min_clearance_m": arena.episode[ended, kernels.MIN_CLEARANCE].tolist(),
         }

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from policy_export.memory import LstmMemory
+from policy_export.memory import LstmMemory, Remembered
 
 F32 = NDArray[np.float32]
 
@@ -120,7 +120,7 @@ class _FastLstm(torch.autograd.Function):
         return d_gates, d_weight, d_h * first, d_c * first, None
 
 
-def fast_lstm_sequence(memory: LstmMemory, features: Tensor, h: Tensor, c: Tensor, reset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def fast_lstm_sequence(memory: LstmMemory, features: Tensor, h: Tensor, c: Tensor, reset: Tensor) -> Remembered:
     """As `LstmMemory.sequence`: features [T, B, F], h, c [B, H], reset [T, B] to output [T, B, H] and the last h, c."""
     if features.dtype != torch.float32 or features.device.type != "cpu":
         return memory.sequence(features, h, c, reset)

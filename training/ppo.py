@@ -19,6 +19,7 @@ from policy_export.memory import LstmMemory
 from policy_export.network import PolicyNetwork
 from training.config import PpoConfig
 from training.fast_lstm import fast_lstm_sequence
+from training.team import Team
 
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 # Beyond this |mean| a tanh is flat: means are pulled back so that gradients stay alive.
@@ -109,9 +110,10 @@ def evaluate_sequences(network: PolicyNetwork, features: Tensor, h0: Tensor, c0:
 class PpoLearner:
     """Owns the optimiser and the adaptive learning rate."""
 
-    def __init__(self, network: PolicyNetwork, config: PpoConfig) -> None:
+    def __init__(self, network: PolicyNetwork, config: PpoConfig, team: Team | None = None) -> None:
         self.network = network
         self.config = config
+        self.team = team or Team()
         self.learning_rate = config.learning_rate
         self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, eps=1e-5, fused=True)
 
@@ -130,7 +132,7 @@ class PpoLearner:
                 for name, value in metrics.items():
                     sums[name] = sums.get(name, 0.0) + value
                 count += 1
-            kl = sum(kls) / len(kls)
+            kl = self.team.mean(sum(kls) / len(kls))
             if self.config.target_kl is not None and kl > _STOP_AT_KL * self.config.target_kl:
                 break
         self._adapt(kl, progress)
@@ -144,11 +146,11 @@ class PpoLearner:
         loss, metrics = self._loss(batch, progress)
         self.optimizer.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
+        self.team.average([parameter.grad for parameter in self.network.parameters() if parameter.grad is not None])
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.max_grad_norm)
-        if not torch.isfinite(loss) or not torch.isfinite(norm):
-            raise TrainingDivergedError(
-                f"loss {loss.item():g}, gradient norm {norm.item():g}: lower ppo.learning_rate and resume"
-            )
+        mean_loss = self.team.mean(loss.item())
+        if not (math.isfinite(mean_loss) and torch.isfinite(norm)):
+            raise TrainingDivergedError(f"loss {mean_loss:g}, gradient norm {norm.item():g}: lower ppo.learning_rate and resume")
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
         self.optimizer.step()

@@ -19,11 +19,12 @@ from training.ppo import Batch, advantages, correlated_log_prob
 
 @dataclass(slots=True)
 class RolloutSummary:
-    """What happened in one rollout: finished episodes by outcome, sums of reward terms, decisions."""
+    """What happened in one rollout: finished episodes by outcome, their lengths and (scaled) returns, sums of reward terms."""
 
     decisions: int = 0
     outcomes: dict[str, int] = field(default_factory=dict)
     episode_ticks: list[float] = field(default_factory=list)
+    returns: list[float] = field(default_factory=list)
     reward_terms: dict[str, float] = field(default_factory=dict)
 
 
@@ -122,5 +123,6 @@ def _summarise(summary: RolloutSummary, info: dict[str, Any], environments: int)
     for outcome in info["outcomes"]:
         summary.outcomes[outcome] = summary.outcomes.get(outcome, 0) + 1
     summary.episode_ticks.extend(info["episode_ticks"])
+    summary.returns.extend(info["episode_return"])
     for name, value in info["reward_terms"].items():
         summary.reward_terms[name] = summary.reward_terms.get(name, 0.0) + value

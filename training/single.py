@@ -40,7 +40,10 @@ class CorridorEnv(gymnasium.Env[Observation, Observation]):
     ) -> None:
         settings = config if isinstance(config, EnvironmentConfig) else EnvironmentConfig.model_validate(config or {})
         paper = layout == "paper"
-        observation, action = paper_layout() if paper else default_layout(), ActionLayout(frame="corridor" if paper else "heading")
+        observation, action = (
+            paper_layout() if paper else default_layout(),
+            ActionLayout(frame="corridor" if paper else "heading"),
+        )
         self.render_mode = render_mode
         self.corridors = CorridorVectorEnv(1, settings, 0, observation, action, FreshWorlds(settings))
         self.observation_space = self.corridors.single_observation_space

@@ -159,11 +159,15 @@ def test_reaching_the_goal_terminates_with_its_bonus():
 
 def test_contact_terminates_with_its_cost_and_the_next_episode_begins():
     env = calm_env(open_world(boxes=[[6.0, -0.5, 0.0, 7.0, 0.5, 10.0]]))
-    observation, _, terminated, _, info = fly(env, [1.0, 0.0, 0.0, 0.0], 200)
-    assert terminated[0]
+    paid = 0.0
+    while not (result := env.step(np.array([[1.0, 0.0, 0.0, 0.0]], np.float32)))[2][0]:
+        paid += result[1][0]
+    observation, reward, _, _, info = result
+    paid += reward[0]
     assert info["outcomes"] == ["contact"]
     assert info["min_clearance_m"][0] <= 0.0
     assert info["reward_terms"]["contact"] == pytest.approx(-2.0)
+    assert info["episode_return"][0] == pytest.approx(paid)
     assert info["final_obs"][0, 180] < 25.0  # the old episode's last goal offset
     assert observation[0, 180] == pytest.approx(26.0, abs=1e-3)  # the new one's first
     assert env.arena.ticks[0] == 0

@@ -157,9 +157,7 @@ def batch_for(net, config, gain):
         raw = mean + net.log_std.exp() * noise
         log_prob = correlated_log_prob(raw, mean, net.log_std, torch.zeros_like(noise), 0.0)
     advantage = gain(raw)
-    return Batch(
-        features, raw, torch.zeros_like(noise), torch.zeros(shape), log_prob, advantage, value + advantage, reset, h, c
-    )
+    return Batch(features, raw, torch.zeros_like(noise), torch.zeros(shape), log_prob, advantage, value + advantage, reset, h, c)
 
 
 CONFIG = PpoConfig(environments=32, steps=8, minibatches=2, epochs=4, learning_rate=3e-3, target_kl=None)

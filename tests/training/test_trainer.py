@@ -22,7 +22,7 @@ from training.checkpoint import CheckpointError, load_checkpoint, save_checkpoin
 from training.config import EvaluationConfig, PpoConfig, TrainingConfig
 from training.evaluation import evaluate, evaluation_environment
 from training.intervals import wilson_interval
-from training.ppo import advantages, correlated_log_prob, evaluate_sequences
+from training.ppo import TrainingDivergedError, advantages, correlated_log_prob, evaluate_sequences
 from training.trainer import Trainer, hold_ticks, layouts
 
 ROOT = Path(__file__).parents[2]
@@ -123,6 +123,28 @@ def test_same_seed_same_weights_another_seed_others(tmp_path):
         run(trainer)
     assert same(weights(trainers[0]), weights(trainers[1]))
     assert not same(weights(trainers[0]), weights(trainers[2]))
+    assert curve(tmp_path / "0") == curve(tmp_path / "1") != curve(tmp_path / "2")
+
+
+def curve(folder):
+    """All that an update recorded, but for the time it took."""
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{name: value for name, value in row.items() if name not in ("seconds", "decisions_per_s")} for row in rows]
+
+
+def test_a_loss_that_is_not_a_number_stops_and_leaves_the_last_good_checkpoint(tmp_path):
+    trainer = Trainer(tiny(), tmp_path)
+    updates = trainer.updates()
+    for _ in range(2):
+        next(updates)
+    trainer.env.rules = trainer.env.rules._replace(scale=1e300)  # rewards beyond float32
+    with pytest.raises(TrainingDivergedError, match=r"loss nan.*lower ppo\.learning_rate"):
+        next(updates)
+    again = Trainer(tiny(), tmp_path)
+    again.resume(tmp_path / "last.pt")
+    assert again.update_count == 2
+    assert all(torch.isfinite(parameter).all() for parameter in again.network.parameters())
+    assert [status.decisions for status in again.updates()] == [3 * UPDATE, 4 * UPDATE]
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
@@ -243,6 +265,14 @@ def test_command_trains_and_reports_json(tmp_path):
     assert "--resume" in again.stderr
 
 
+def test_command_says_that_training_diverged(tmp_path):
+    preset = write_preset(tmp_path / "wild.yaml", environment={"world_pool": 4, "reward": {"progress_per_m": 1e300}})
+    result = CliRunner().invoke(cli.app, ["--config", str(preset), "--out", str(tmp_path / "run")])
+    assert result.exit_code == 1
+    assert "training diverged: loss nan" in result.stderr
+    assert not (tmp_path / "run" / "last.pt").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -280,13 +310,16 @@ def last_decisions(metrics):
 
 
 def test_killed_run_goes_on_and_a_terminated_one_saves(tmp_path):
-    preset = write_preset(tmp_path / "long.yaml", decisions=10_000_000, evaluation={"every_decisions": 10_000_000})
+    preset = write_preset(
+        tmp_path / "long.yaml", decisions=10_000_000, checkpoint_every_updates=1, evaluation={"every_decisions": 10_000_000}
+    )
     out = tmp_path / "run"
     process = start(["--config", str(preset), "--out", str(out)])
     wait_for(out / "last.pt")
     process.kill()
     process.communicate(timeout=30)
     before = load_checkpoint(out / "last.pt", resume=True)["training"]["steps"]
+    assert last_decisions(out / "metrics.jsonl") - before <= UPDATE
     process = start(["--resume", str(out)])
     metrics = out / "metrics.jsonl"
     end = time.monotonic() + 120.0
