@@ -233,7 +233,8 @@ class VerificationRecord(_Model):
 class PolicyMetadata(_Model):
     """Everything a program needs to fly the file. Kept as JSON in the ONNX file under `METADATA_KEY`.
 
-    `memory` names the recurrent cell; a `gru` passes c through unchanged. `hidden_size` is 0 exactly when it is `none`, and then the graph has no state inputs.
+    `memory` names the recurrent cell; a `gru` passes c through unchanged. `hidden_size` is 0 exactly when it is `none`, and
+    then the graph has no state inputs.
     `layers`: stacked cells of `hidden_size` each; h and c are [layers, batch, hidden_size].
     """
 

@@ -104,7 +104,10 @@ def convergence_episode(curves: Curves, last: int) -> float:
 def flown_measures(
     run: Run, splits: dict[str, Split], safety: SafetyConfig, episodes: int, workers: int | None
 ) -> dict[str, Any]:
-    """The rows that flights of the trained policy give: training dynamics, no safety layer, as in the article. Kept in the run."""
+    """The rows that flights of the trained policy give: training dynamics, no safety layer, as in the article.
+
+    They are kept in the run's folder.
+    """
     path = run.folder / "flights.json"
     asked = {"episodes": episodes, "decisions": run.config.decisions}
     if path.exists() and (kept := json.loads(path.read_text()))["asked"] == asked:
