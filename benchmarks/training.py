@@ -18,6 +18,7 @@ from statistics import median
 from typing import Any
 
 ENVIRONMENTS, STEPS, BATCH, EPOCHS = 64, 128, 2048, 4
+SEQUENCE = 64  # as the article; SB3 cuts its sequences at episode ends and once at random
 ROUNDS, TWO_CORE_UPDATES = 3, 14
 ONE_CORE_TARGET, TWO_CORE_TARGET, LIMIT_TARGET = 6.0, 10.0, 0.35
 ARTICLE_DECISIONS, ARTICLE_MINUTES = 27_000 * 170, 15.0
@@ -32,6 +33,7 @@ CONFIG: dict[str, Any] = {
     "ppo": {
         "environments": ENVIRONMENTS,
         "steps": STEPS,
+        "sequence": SEQUENCE,
         "epochs": EPOCHS,
         "minibatches": ENVIRONMENTS * STEPS // BATCH,
         "target_kl": None,

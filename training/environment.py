@@ -200,7 +200,7 @@ class CorridorVectorEnv(VectorEnv):
         self.rng.bit_generator.state = state["rng"]
         self._observations[...] = np.asarray(state["observations"])
         if isinstance(self.worlds, WorldPool):
-            self.worlds.restore(np.asarray(state["pool"]["seeds"]), state["pool"]["oldest"])
+            self.worlds.restore(state["pool"])
 
 
 def make_rules(config: EnvironmentConfig, layout: ObservationLayout, action: ActionLayout) -> Rules:

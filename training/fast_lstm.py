@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from policy_export.memory import LstmMemory, Remembered
+from policy_export.memory import LstmMemory, Memory, Remembered
 
 F32 = NDArray[np.float32]
 
@@ -118,6 +118,32 @@ class _FastLstm(torch.autograd.Function):
         d_weight = d_gates.reshape(-1, width).t() @ h_before[:-1].reshape(-1, width // 4)
         first = keep[0].unsqueeze(1)
         return d_gates, d_weight, d_h * first, d_c * first, None
+
+
+class RolloutMemory:
+    """One step after another of an `LstmMemory` whose weights stay as they are while a rollout lasts, without gradients."""
+
+    def __init__(self, memory: LstmMemory, batch: int) -> None:
+        weight_ih, weight_hh, bias_ih, bias_hh = memory.weights()
+        self._weight = torch.cat((weight_ih, weight_hh), dim=1).t().contiguous()
+        self._bias = bias_ih + bias_hh
+        self._keep: F32 = np.ones((2, batch), np.float32)  # whoever calls has masked the states
+
+    def step(self, features: Tensor, h: Tensor, c: Tensor) -> Remembered:
+        """As `LstmMemory.step`: features [B, F], h, c [B, H]."""
+        gates = torch.addmm(self._bias, torch.cat((features, h), dim=1), self._weight)
+        states, outputs = features.new_empty(2, 2, *c.shape), features.new_empty(2, 1, *c.shape)
+        states[0, 0] = c
+        cells, hiddens = states.numpy()
+        _open_gates(0, gates.unsqueeze(0).numpy(), cells, *outputs.numpy(), hiddens, self._keep)
+        return outputs[1, 0], outputs[1, 0], states[0, 1]
+
+
+def rollout_memory(memory: Memory, batch: int) -> Memory | RolloutMemory:
+    """What a rollout steps: the compiled form of an LSTM on the CPU, any other memory as it is."""
+    if isinstance(memory, LstmMemory) and next(memory.parameters()).device.type == "cpu":
+        return RolloutMemory(memory, batch)
+    return memory
 
 
 def fast_lstm_sequence(memory: LstmMemory, features: Tensor, h: Tensor, c: Tensor, reset: Tensor) -> Remembered:

@@ -63,16 +63,12 @@ def advantages(
     step. ``decay`` is (gamma, lambda) per decision.
     """
     gamma, lam = decay
-    result = torch.zeros_like(rewards)
-    running = torch.zeros_like(last_value)
-    following = last_value
-    for t in range(rewards.shape[0] - 1, -1, -1):
-        ended = terminated[t] | truncated[t]
-        next_value = torch.where(ended, torch.where(truncated[t], final_values[t], torch.zeros_like(following)), following)
-        delta = rewards[t] + gamma * next_value - values[t]
-        running = delta + gamma * lam * torch.where(ended, torch.zeros_like(running), running)
-        result[t] = running
-        following = values[t]
+    following = torch.cat((values[1:], last_value.unsqueeze(0)))
+    next_value = torch.where(truncated, final_values, torch.where(terminated, torch.zeros_like(following), following))
+    result = rewards + gamma * next_value - values  # temporal differences, summed up from the end
+    carried = gamma * lam * (~(terminated | truncated)).to(rewards.dtype)
+    for t in range(rewards.shape[0] - 2, -1, -1):
+        result[t].addcmul_(carried[t], result[t + 1])
     return result, result + values
 
 

@@ -11,9 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from policy_export.memory import Memory
 from policy_export.network import PolicyNetwork
 from training.config import PpoConfig
 from training.environment import CorridorVectorEnv
+from training.fast_lstm import RolloutMemory, rollout_memory
 from training.ppo import Batch, advantages, correlated_log_prob
 
 
@@ -26,6 +28,16 @@ class RolloutSummary:
     episode_ticks: list[float] = field(default_factory=list)
     returns: list[float] = field(default_factory=list)
     reward_terms: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """What is the same in every decision of a rollout: ticks per action, noise correlation and deviation, the memory."""
+
+    hold: int
+    rho: float
+    std: Tensor
+    memory: Memory | RolloutMemory
 
 
 class RolloutCollector:
@@ -58,37 +70,46 @@ class RolloutCollector:
 
     @torch.no_grad()
     def collect(self, hold: int) -> tuple[Batch, RolloutSummary]:
-        """One rollout with every action held for ``hold`` ticks. Fields of the batch are [T, B, ...]."""
+        """One rollout with every action held for ``hold`` ticks, cut into sequences: fields of the batch are [L, C * B, ...]."""
         network, summary = self.network, RolloutSummary()
-        rho = self.config.noise_correlation_per_tick**hold
-        h0, c0 = (self.h[0].clone(), self.c[0].clone())
-        exploration = (rho, math.sqrt(1.0 - rho * rho), network.log_std.exp())
-        rows = [self._decide(hold, exploration, summary) for _ in range(self.config.steps)]
+        rho, length = self.config.noise_correlation_per_tick**hold, self.config.sequence or self.config.steps
+        step = _Step(hold, rho, network.log_std.exp(), rollout_memory(network.memory, self.env.num_envs))
+        rows, states = [], []
+        for t in range(self.config.steps):
+            if t % length == 0:
+                states.append((self.h[0].clone(), self.c[0].clone()))
+            rows.append(self._decide(step, summary))
         stacked = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+        self._judge(stacked, rho, hold)
+        h0, c0 = (torch.cat(parts) for parts in zip(*states, strict=True))
+        return Batch(**{name: _cut(field, length) for name, field in stacked.items()}, h0=h0, c0=c0), summary
+
+    def _judge(self, stacked: dict[str, Tensor], rho: float, hold: int) -> None:
+        """Turn what the rollout left into what the learner needs: log-densities, advantages, targets. Fields are [T, B, ...]."""
+        network = self.network
         values = network.value_head(stacked.pop("joined")).squeeze(-1)
-        log_prob = correlated_log_prob(
-            stacked["raw"], stacked.pop("mean"), network.log_std, stacked["noise_before"], torch.tensor(rho)
+        stacked["log_prob"] = correlated_log_prob(
+            stacked["raw"], stacked.pop("mean"), network.log_std, stacked["noise_before"], rho
         )
+        stacked["rho"] = torch.full_like(stacked["log_prob"], rho)
         last_value = self._value(self.observation, torch.arange(self.env.num_envs, device=self.device), keep_reset=True)
         decay = (self.config.gamma_per_tick**hold, self.config.gae_lambda)
-        ends = (stacked.pop("terminated"), stacked.pop("truncated"), stacked.pop("final_value"))
+        ends = [stacked.pop(name) for name in ("terminated", "truncated", "final_value")]
         advantage, target = advantages(stacked.pop("reward"), values, last_value, *ends, decay)
-        return Batch(
-            **stacked, log_prob=log_prob, rho=torch.full_like(log_prob, rho), advantage=advantage, target=target, h0=h0, c0=c0
-        ), summary
+        stacked |= {"advantage": advantage, "target": target}
 
-    def _decide(self, hold: int, exploration: tuple[float, float, Tensor], summary: RolloutSummary) -> dict[str, Tensor]:
-        """One decision of every environment; advances all state. ``exploration``: correlation, fresh share, deviation."""
-        network, (rho, fresh, std) = self.network, exploration
+    def _decide(self, step: _Step, summary: RolloutSummary) -> dict[str, Tensor]:
+        """One decision of every environment; advances all state."""
+        network, rho = self.network, step.rho
         features, reset, noise_before = network.features(self.observation), self.reset, self.noise
         keep = (~reset).float().unsqueeze(-1)
-        memory, h, c = network.memory.step(features, self.h[0] * keep, self.c[0] * keep)
+        memory, h, c = step.memory.step(features, self.h[0] * keep, self.c[0] * keep)
         self.h, self.c = h.unsqueeze(0), c.unsqueeze(0)
         joined = network.join(memory, features)
         mean = network.policy_head(joined)
-        self.noise = rho * noise_before + fresh * self._fresh_noise()
-        raw = mean + std * self.noise
-        observation, reward, terminated, truncated, info = self.env.step_held(network.action(raw).cpu().numpy(), hold)
+        self.noise = rho * noise_before + math.sqrt(1.0 - rho * rho) * self._fresh_noise()
+        raw = mean + step.std * self.noise
+        observation, reward, terminated, truncated, info = self.env.step_held(network.action(raw).cpu().numpy(), step.hold)
         row = {"features": features, "joined": joined, "mean": mean, "raw": raw, "noise_before": noise_before, "reset": reset}
         row |= {"reward": self._tensor(reward.astype(np.float32)), "terminated": self._tensor(terminated)}
         row["truncated"] = self._tensor(truncated)
@@ -116,6 +137,13 @@ class RolloutCollector:
             final = self._tensor(info["final_obs"][index.cpu().numpy()])
             result[index] = self._value(final, index, keep_reset=False)
         return result
+
+
+def _cut(field: Tensor, length: int) -> Tensor:
+    """[T, B, ...] to sequences of ``length`` side by side, [length, T / length * B, ...]."""
+    steps, batch = field.shape[:2]
+    parts = field.reshape(steps // length, length, batch, *field.shape[2:])
+    return parts.transpose(0, 1).reshape(length, -1, *field.shape[2:])
 
 
 def _summarise(summary: RolloutSummary, info: dict[str, Any], environments: int) -> None:

@@ -239,11 +239,14 @@ def test_training_corridors_never_come_from_evaluation_seeds():
 
 def test_the_pool_is_renewed():
     rng = np.random.default_rng(0)
-    pool = WorldPool(EnvironmentConfig(world_pool=4), rng)
-    before = set(pool.seeds.tolist())
-    for _ in range(4):
+    pool = WorldPool(EnvironmentConfig(world_pool=4, world_renewal_episodes=3), rng)
+    before = pool.seeds.tolist()
+    for _ in range(11):
         pool.next_world(0, rng)
-    assert not before & set(pool.seeds.tolist())
+    assert pool.seeds.tolist()[3] == before[3]
+    assert not set(before[:3]) & set(pool.seeds.tolist())
+    pool.next_world(0, rng)
+    assert not set(before) & set(pool.seeds.tolist())
 
 
 def test_moving_share_gives_moving_corridors():

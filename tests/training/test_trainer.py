@@ -30,13 +30,16 @@ PRESETS = sorted((ROOT / "configs" / "training").glob("*.yaml"))
 UPDATE = 8 * 16
 
 
+TINY_PPO = {"environments": 8, "steps": 16, "epochs": 2, "minibatches": 2}
+
+
 def tiny(**changes):
     base = {
         "decisions": 4 * UPDATE,
         "checkpoint_every_updates": 1,
         "environment": {"world_pool": 4, "time_limit_s": 3.0},
         "network": {"hidden_size": 16, "head_size": 8},
-        "ppo": {"environments": 8, "steps": 16, "epochs": 2, "minibatches": 2},
+        "ppo": TINY_PPO,
         "evaluation": {"every_decisions": 2 * UPDATE, "episodes": 3},
     }
     return TrainingConfig.model_validate(base | changes)
@@ -65,9 +68,10 @@ def test_presets_load_and_make_a_network(path):
     assert trainer.network.config.action_low == action.low
 
 
+@pytest.mark.parametrize("sequence", [None, 4])
 @pytest.mark.parametrize("memory", ["lstm", "gru", "stack", "none"])
-def test_the_learner_sees_what_the_rollout_did(tmp_path, memory):
-    trainer = Trainer(tiny(memory=memory), tmp_path)
+def test_the_learner_sees_what_the_rollout_did(tmp_path, memory, sequence):
+    trainer = Trainer(tiny(memory=memory, ppo={**TINY_PPO, "sequence": sequence}), tmp_path)
     resets = 0
     for hold in (4, 1):
         batch, summary = trainer.collector.collect(hold)
@@ -77,6 +81,7 @@ def test_the_learner_sees_what_the_rollout_did(tmp_path, memory):
         torch.testing.assert_close(log_prob, batch.log_prob, atol=1e-4, rtol=1e-4)
         torch.testing.assert_close(value, batch.target - batch.advantage, atol=1e-4, rtol=1e-4)
         assert summary.decisions == UPDATE
+        assert batch.reset.shape == (sequence or 16, UPDATE // (sequence or 16))
         resets += int(batch.reset[1:].sum())
     assert resets > 0  # three-second episodes end inside the rollouts
 
@@ -209,6 +214,7 @@ def test_hold_falls_with_the_schedule():
     ("section", "message"),
     [
         ({"ppo": {"environments": 10, "minibatches": 4}}, "multiple of minibatches"),
+        ({"ppo": {"steps": 64, "sequence": 48}}, "multiple of sequence"),
         ({"ppo": {"hold": [{"share": 0.5, "ticks": 1}]}}, "start at share 0"),
         ({"evaluation": {"seed": 12}}, "greater than or equal to 1000000"),
         ({"decision": 3}, "Extra inputs"),
