@@ -11,7 +11,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from training.environment import CorridorVectorEnv
 
-POLICY = {"lstm_hidden_size": 128, "net_arch": {"pi": [64], "vf": [64]}, "shared_lstm": True, "enable_critic_lstm": False}
+SIZES = {"lstm_hidden_size": 128, "net_arch": {"pi": [64], "vf": [64]}}
+SHARED = {"shared_lstm": True, "enable_critic_lstm": False}
 
 
 class Sb3Corridors(VecEnv):
@@ -51,6 +52,7 @@ class Sb3Corridors(VecEnv):
         return [False] * self.num_envs
 
 
-def recurrent_ppo(env: CorridorVectorEnv, **settings: Any) -> RecurrentPPO:
-    """RecurrentPPO with the same network as ours: LSTM 128 for actor and critic, heads of 64, tanh."""
-    return RecurrentPPO("MlpLstmPolicy", Sb3Corridors(env), policy_kwargs=POLICY, device="cpu", seed=0, **settings)
+def recurrent_ppo(env: CorridorVectorEnv, *, shared: bool, **settings: Any) -> RecurrentPPO:
+    """RecurrentPPO with an LSTM of 128 and heads of 64, tanh. Its critic has an LSTM of its own, unless it is `shared`, as ours."""
+    policy = SIZES | (SHARED if shared else {})
+    return RecurrentPPO("MlpLstmPolicy", Sb3Corridors(env), policy_kwargs=policy, device="cpu", seed=0, **settings)
