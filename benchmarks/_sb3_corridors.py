@@ -53,6 +53,6 @@ class Sb3Corridors(VecEnv):
 
 
 def recurrent_ppo(env: CorridorVectorEnv, *, shared: bool, **settings: Any) -> RecurrentPPO:
-    """RecurrentPPO with an LSTM of 128 and heads of 64, tanh. Its critic has an LSTM of its own, unless it is `shared`, as ours."""
+    """RecurrentPPO with an LSTM of 128 and heads of 64, tanh; its critic has one of its own, unless it is `shared`, as ours."""
     policy = SIZES | (SHARED if shared else {})
     return RecurrentPPO("MlpLstmPolicy", Sb3Corridors(env), policy_kwargs=policy, device="cpu", seed=0, **settings)

@@ -88,8 +88,8 @@ class TrainingFlight:
     def _state(self, now_s: float) -> VehicleState:
         row, truth = self.env.arena.estimate[0].tolist(), self.env.arena.vehicle[0]
         roll, pitch = vehicle.roll_pitch_rad(truth)
-        vectors = (CorridorVector(*row[k : k + 3]) for k in (0, 3, 6))
-        return VehicleState(now_s, *vectors, roll, pitch, row[9], float(truth[vehicle.OMEGA + 2]))
+        position, velocity, acceleration = (CorridorVector(*row[k : k + 3]) for k in (0, 3, 6))
+        return VehicleState(now_s, position, velocity, acceleration, roll, pitch, row[9], float(truth[vehicle.OMEGA + 2]))
 
     def _result(self) -> EpisodeResult:
         arena, world = self.env.arena, self.world

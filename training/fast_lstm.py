@@ -135,7 +135,8 @@ class RolloutMemory:
         states, outputs = features.new_empty(2, 2, *c.shape), features.new_empty(2, 1, *c.shape)
         states[0, 0] = c
         cells, hiddens = states.numpy()
-        _open_gates(0, gates.unsqueeze(0).numpy(), cells, *outputs.numpy(), hiddens, self._keep)
+        tanh_c, output = outputs.numpy()
+        _open_gates(0, gates.unsqueeze(0).numpy(), cells, tanh_c, output, hiddens, self._keep)
         return outputs[1, 0], outputs[1, 0], states[0, 1]
 
 

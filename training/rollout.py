@@ -94,8 +94,8 @@ class RolloutCollector:
         stacked["rho"] = torch.full_like(stacked["log_prob"], rho)
         last_value = self._value(self.observation, torch.arange(self.env.num_envs, device=self.device), keep_reset=True)
         decay = (self.config.gamma_per_tick**hold, self.config.gae_lambda)
-        ends = [stacked.pop(name) for name in ("terminated", "truncated", "final_value")]
-        advantage, target = advantages(stacked.pop("reward"), values, last_value, *ends, decay)
+        terminated, truncated, final = (stacked.pop(name) for name in ("terminated", "truncated", "final_value"))
+        advantage, target = advantages(stacked.pop("reward"), values, last_value, terminated, truncated, final, decay)
         stacked |= {"advantage": advantage, "target": target}
 
     def _decide(self, step: _Step, summary: RolloutSummary) -> dict[str, Tensor]:

@@ -72,15 +72,17 @@ def markdown(table: dict[str, Any], command: str) -> str:
 def reading(table: dict[str, Any]) -> list[str]:
     """Where the memory helps, where it harms, and where these runs cannot tell."""
     first, second = table["algorithms"]
-    helps, harms, open_ = [], [], []
+    helps: list[str] = []
+    harms: list[str] = []
+    unclear: list[str] = []
     for name, (label, more_is_better) in MEASURES.items():
         row = table["rows"][name]
         difference = row["ours"][second]["mean"] - row["ours"][first]["mean"]
         if more_is_better is None or not math.isfinite(difference):
             continue
-        chosen = open_ if row["p"] > LEVEL else helps if (difference > 0.0) == more_is_better else harms
+        chosen = unclear if row["p"] > LEVEL else helps if (difference > 0.0) == more_is_better else harms
         chosen.append(f"{label} (p = {row['p']:.3f})")
-    groups = ((f"{second} is better", helps), (f"{first} is better", harms), ("No difference that these seeds could show", open_))
+    groups = ((f"{second} is better", helps), (f"{first} is better", harms), ("No difference that these seeds could show", unclear))
     return [f"- {title}: {'; '.join(found) or 'in no measure'}." for title, found in groups]
 
 
