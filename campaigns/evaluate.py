@@ -13,7 +13,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from campaigns.lockstep import LockstepFlight, StackConfig
 from campaigns.splits import Split
 from campaigns.statistics import EpisodeResult, summarise
-from campaigns.training_flight import TrainingFlight
 from campaigns.workers import over_processes, over_ray
 from policy_export.policy_file import check_policy_bytes
 from policy_export.runner import PolicyRunner
@@ -65,8 +64,12 @@ def fly_elsewhere(campaign: Campaign, policy: bytes, index: int) -> EpisodeResul
 
 
 def _fly(campaign: Campaign, runner: PolicyRunner, index: int) -> EpisodeResult:
-    flight = TrainingFlight if campaign.dynamics == TRAINING else LockstepFlight
-    return flight(campaign.split.world(index), campaign.stack(), runner).run()
+    world, stack = campaign.split.world(index), campaign.stack()
+    if campaign.dynamics != TRAINING:
+        return LockstepFlight(world, stack, runner).run()
+    from campaigns.training_flight import TrainingFlight  # noqa: PLC0415  # needs the trainer's libraries
+
+    return TrainingFlight(world, stack, runner).run()
 
 
 def run_campaign(

@@ -82,7 +82,7 @@ def reading(table: dict[str, Any]) -> list[str]:
             continue
         chosen = unclear if row["p"] > LEVEL else helps if (difference > 0.0) == more_is_better else harms
         chosen.append(f"{label} (p = {row['p']:.3f})")
-    groups = ((f"{second} is better", helps), (f"{first} is better", harms), ("No difference that these seeds could show", unclear))
+    groups = ((f"{second} is better", helps), (f"{first} is better", harms), ("No difference that these seeds show", unclear))
     return [f"- {title}: {'; '.join(found) or 'in no measure'}." for title, found in groups]
 
 
