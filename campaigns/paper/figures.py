@@ -14,6 +14,7 @@ from matplotlib.patches import Rectangle
 from campaigns.evaluate import Campaign
 from campaigns.lockstep import StackConfig
 from campaigns.paper.measures import MEASURES, Curves, write_json
+from campaigns.paper.report import NOTES
 from campaigns.paper.runs import Run
 from campaigns.splits import Split
 from campaigns.training_flight import TrainingFlight
@@ -108,7 +109,11 @@ def draw_bars(out: Path, table: dict[str, Any]) -> None:
                 axes.text(k, 0.0, "no figure", ha="center", va="bottom", rotation=90, fontsize=7)
             spread = [[ours["mean"] - ours["low"]], [ours["high"] - ours["mean"]]]
             axes.bar(2.5 + k, ours["mean"], yerr=np.nan_to_num(spread), color=colour, capsize=3)
-        axes.set_xticks([0.5, 3.0], ["article", "here"])
+        axes.set_xticks([0.5, 3.0], ["article *" if measure in NOTES else "article", "here"])
+        axes.set_xlim(-0.6, 4.1)
         axes.set_title(MEASURES[measure][0], fontsize=9)
+    figure.supxlabel(
+        f"blue: {table['algorithms'][0]}, red: {table['algorithms'][1]}; * defined otherwise, see README.md", fontsize=9
+    )
     figure.savefig(out / "figure_9_measures.png", dpi=DOTS_PER_INCH)
     write_json(out / "figure_9_measures.json", {measure: table["rows"][measure] for measure in BARS})

@@ -271,6 +271,16 @@ def test_command_trains_and_reports_json(tmp_path):
     assert "--resume" in again.stderr
 
 
+def test_command_takes_another_memory_and_refuses_an_unknown_one(tmp_path):
+    preset = write_preset(tmp_path / "small.yaml", decisions=UPDATE)
+    result = CliRunner().invoke(cli.app, ["--config", str(preset), "--out", str(tmp_path / "run"), "--memory", "gru"])
+    assert result.exit_code == 0, result.output
+    assert load_checkpoint(tmp_path / "run" / "last.pt")["network_config"]["memory"] == "gru"
+    result = CliRunner().invoke(cli.app, ["--config", str(preset), "--out", str(tmp_path / "other"), "--memory", "ltsm"])
+    assert result.exit_code == 2
+    assert "memory: Input should be 'lstm', 'gru', 'stack' or 'none'" in result.stderr
+
+
 def test_command_says_that_training_diverged(tmp_path):
     preset = write_preset(tmp_path / "wild.yaml", environment={"world_pool": 4, "reward": {"progress_per_m": 1e300}})
     result = CliRunner().invoke(cli.app, ["--config", str(preset), "--out", str(tmp_path / "run")])
