@@ -15,14 +15,17 @@ EXAMPLES = """Examples:
   evaluate-policy policies/corridor_ppo_lstm.onnx --split unseen --episodes 200
 
   evaluate-policy policies/corridor_ppo_lstm.onnx --split dynamic --safety off --json
+
+  evaluate-policy policies/*.onnx --split all --dynamics training --episodes 1000 --out results/splits.json
 """
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
 class Dynamics(StrEnum):
-    """What flies: the gateway's vehicle in lockstep."""
+    """What flies: the trainer's compiled kernels, the gateway's vehicle, or JSBSim, all under the same stack."""
 
+    TRAINING = "training"
     INTERNAL = "internal"
     JSBSIM = "jsbsim"
 
@@ -37,7 +40,9 @@ class Switch(StrEnum):
 @app.command(epilog=EXAMPLES)
 def evaluate(
     policies: Annotated[list[Path], typer.Argument(help="policy files (.onnx)")],
-    split: Annotated[str, typer.Option(help="named set of corridors in --splits")] = "unseen",
+    split: Annotated[
+        list[str] | None, typer.Option(help="named set of corridors in --splits; repeat it for several, or `all`")
+    ] = None,
     episodes: Annotated[int, typer.Option(min=1, max=100_000, help="corridors to fly")] = 200,
     dynamics: Annotated[Dynamics, typer.Option(help="what flies")] = Dynamics.INTERNAL,
     safety: Annotated[Switch, typer.Option(help="with or without the safety layer")] = Switch.ON,
@@ -47,65 +52,49 @@ def evaluate(
     ),
     splits: Annotated[Path, typer.Option(help="file that names the splits")] = Path("configs/evaluation.yaml"),
     workers: Annotated[int | None, typer.Option(min=1, help="processes; default: all cores")] = None,
-    out: Annotated[Path | None, typer.Option(help="write the whole result, every episode, to this JSON file")] = None,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="fly on the Ray cluster at HOST:PORT instead (extra `cluster`)")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="write the whole result, every episode, to this JSON file; the tables beside it as .md")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
     """Fly policies through named corridors, whole stack in lockstep: policy file, safety, vehicle, LiDAR."""
-    from campaigns.evaluate import Campaign, report, run_campaign
-    from campaigns.splits import load_split
+    from campaigns.evaluate import TRAINING, Campaign, report, run_campaign
+    from campaigns.splits import load_splits
     from flight.mission import load_mission
     from policy_export.runner import PolicyRunner
     from sim_gateway.dynamics import require_dynamics
 
-    require_dynamics(dynamics.value)
-    chosen = load_split(split, splits)
+    if dynamics.value != TRAINING:
+        require_dynamics(dynamics.value)
+    chosen = load_splits(split or ["unseen"], splits)
     if seed is not None:
-        chosen = chosen.model_copy(update={"first_seed": seed})
+        chosen = {name: one.model_copy(update={"first_seed": seed}) for name, one in chosen.items()}
     flown = load_mission(mission)
     for policy in policies:
         PolicyRunner.load(policy)  # a bad file is refused before any work is done
     reports = []
     for policy in policies:
-        campaign = Campaign(policy, chosen, flown.safety, safety is Switch.ON, flown.goal.radius_m, dynamics.value)
-        results = run_campaign(campaign, episodes, workers)
-        reports.append(report(campaign, split, results))
+        for name, one in chosen.items():
+            campaign = Campaign(policy, one, flown.safety, safety is Switch.ON, flown.goal.radius_m, dynamics.value)
+            reports.append(report(campaign, name, run_campaign(campaign, episodes, workers, ray)))
     _write(reports, out, as_json)
 
 
 def _write(reports: list[dict[str, Any]], out: Path | None, as_json: bool) -> None:
-    result: Any = reports[0] if len(reports) == 1 else reports
+    from campaigns.evaluation_report import markdown
+
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps(result, indent=1) + "\n")
+        out.write_text(json.dumps(reports[0] if len(reports) == 1 else reports, indent=1) + "\n")
+        out.with_suffix(".md").write_text(markdown(reports))
     if as_json:
         short = [{k: v for k, v in r.items() if k != "episodes"} for r in reports]
         print(json.dumps(short[0] if len(short) == 1 else short, indent=1))
         return
-    for one in reports:
-        print(markdown(one))
-
-
-def markdown(one: dict[str, Any]) -> str:
-    """One evaluation as a small table."""
-
-    def rate(name: str) -> str:
-        p = one[name]
-        return f"{100 * p['rate']:.1f} % [{100 * p['low']:.1f}, {100 * p['high']:.1f}] of {p['n']}"
-
-    rows = [
-        ("policy", f"{one['policy']} ({one['policy_sha256'][:12]})"),
-        ("corridors", f"{one['split']}: {one['description']}, seeds from {one['first_seed']}"),
-        ("dynamics", one["dynamics"]),
-        ("safety layer", "on" if one["safety"] else "off"),
-        ("clean success (goal within 0.3 m, no contact), 95 % interval", rate("clean_success")),
-        ("success (contacts allowed)", rate("success")),
-        ("collisions per episode", f"{one['collisions_per_episode']:.3f}"),
-        ("path efficiency", f"{one['path_efficiency']:.3f}"),
-        ("episode length", f"{one['episode_steps']:.0f} ticks, {one['duration_s']:.1f} s"),
-        ("least clearance", f"{one['min_clearance_m']:.2f} m (mean of episodes {one['mean_min_clearance_m']:.2f} m)"),
-        ("failures", "; ".join(f"{cause}: seeds {seeds[:8]}" for cause, seeds in one["failures"].items()) or "none"),
-    ]
-    return "\n".join(["| figure | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows), ""])
+    print(markdown(reports))
 
 
 def main() -> None:

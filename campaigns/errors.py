@@ -7,4 +7,9 @@ from policy_export.errors import PolicyFileError, PolicyRateError
 from sim_gateway.errors import DynamicsError
 from strict_yaml import ConfigError
 
-USER_ERRORS = (ConfigError, DynamicsError, FlyError, PolicyFileError, PolicyRateError)
+
+class ClusterError(Exception):
+    """The Ray cluster cannot be used; the message says why."""
+
+
+USER_ERRORS = (ClusterError, ConfigError, DynamicsError, FlyError, PolicyFileError, PolicyRateError)

@@ -1,12 +1,9 @@
-"""Many flights of one policy on one split, over all cores, with progress; the result as one JSON-able object."""
+"""Many flights of one policy on one split, over all cores or a Ray cluster, with progress; the result as one JSON-able object."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +13,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from campaigns.lockstep import LockstepFlight, StackConfig
 from campaigns.splits import Split
 from campaigns.statistics import EpisodeResult, summarise
+from campaigns.workers import over_processes, over_ray
+from policy_export.policy_file import check_policy_bytes
 from policy_export.runner import PolicyRunner
 from safety.config import SafetyConfig
-from sim_gateway.lidar import LidarConfig
 from sim_gateway.simulation import WindConfig
 
-_runners: dict[Path, PolicyRunner] = {}
+TRAINING = "training"
+_runners: dict[bytes | Path, PolicyRunner] = {}
 
 
 @dataclass(frozen=True, slots=True)
 class Campaign:
-    """A policy on a split: everything a worker process needs."""
+    """A policy on a split: everything a worker process needs. `dynamics`: one of the gateway's, or `TRAINING`."""
 
     policy: Path
     split: Split
@@ -39,14 +38,14 @@ class Campaign:
         """The conditions of every episode."""
         return StackConfig(
             policy=self.policy,
-            safety=self.safety,
+            safety=self.split.safety(self.safety),
             filtered=self.filtered,
             takeoff_height_m=self.split.takeoff_height_m,
             arrival_radius_m=self.arrival_radius_m,
             estimate=self.split.estimate,
             dynamics=self.dynamics,
             wind=WindConfig(self.split.wind_m_s, self.split.gust_sigma_m_s),
-            lidar=LidarConfig.device(self.split.dropout),
+            lidar=self.split.lidar(),
         )
 
 
@@ -54,30 +53,41 @@ def fly_episode(campaign: Campaign, index: int) -> EpisodeResult:
     """The `index`-th episode; the runner is loaded once per process, its hidden state is zeroed at each start."""
     if campaign.policy not in _runners:
         _runners[campaign.policy] = PolicyRunner.load(campaign.policy)
-    return LockstepFlight(campaign.split.world(index), campaign.stack(), _runners[campaign.policy]).run()
+    return _fly(campaign, _runners[campaign.policy], index)
 
 
-def run_campaign(campaign: Campaign, episodes: int, workers: int | None = None) -> list[EpisodeResult]:
-    """All episodes, in the order of their seeds, on `workers` processes (all cores by default)."""
-    workers = min(workers or os.cpu_count() or 1, episodes)
+def fly_elsewhere(campaign: Campaign, policy: bytes, index: int) -> EpisodeResult:
+    """As `fly_episode`, on a machine that may not have the policy's file: its bytes come along."""
+    if policy not in _runners:
+        _runners[policy] = PolicyRunner(check_policy_bytes(policy, campaign.policy))
+    return _fly(campaign, _runners[policy], index)
+
+
+def _fly(campaign: Campaign, runner: PolicyRunner, index: int) -> EpisodeResult:
+    world, stack = campaign.split.world(index), campaign.stack()
+    if campaign.dynamics != TRAINING:
+        return LockstepFlight(world, stack, runner).run()
+    from campaigns.training_flight import TrainingFlight  # noqa: PLC0415  # needs the trainer's libraries
+
+    return TrainingFlight(world, stack, runner).run()
+
+
+def run_campaign(
+    campaign: Campaign, episodes: int, workers: int | None = None, ray_address: str | None = None
+) -> list[EpisodeResult]:
+    """All episodes, in the order of their seeds: on `workers` processes (all cores by default), or on a Ray cluster."""
+    if ray_address is None:
+        arriving = over_processes(partial(fly_episode, campaign), episodes, workers)
+    else:
+        arriving = over_ray(partial(fly_elsewhere, campaign, campaign.policy.read_bytes()), episodes, ray_address)
     with _progress() as progress:
         bar = progress.add_task("flying", total=episodes, clean=0, done=0)
         results: dict[int, EpisodeResult] = {}
-        for index, result in _results(campaign, episodes, workers):
+        for index, result in arriving:
             results[index] = result
             clean = sum(r.clean_success for r in results.values())
             progress.update(bar, advance=1, clean=f"{100 * clean / len(results):.1f}")
     return [results[i] for i in range(episodes)]
-
-
-def _results(campaign: Campaign, episodes: int, workers: int) -> Iterator[tuple[int, EpisodeResult]]:
-    if workers == 1:
-        yield from ((i, fly_episode(campaign, i)) for i in range(episodes))
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        futures = {pool.submit(fly_episode, campaign, i): i for i in range(episodes)}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
 
 
 def _progress() -> Progress:

@@ -173,18 +173,10 @@ class LockstepFlight:
         watch.least_distance_m = min(watch.least_distance_m, math.dist(truth.position_m, self.world.goal))
         watch.velocities.append(truth.velocity_m_s)
         if self.simulation.contacts and watch.first_contact is None:
-            watch.first_contact = self._what_was_hit(truth)
+            boxes, fixed = self.simulation.boxes(), len(self.world.static_boxes)
+            watch.first_contact = what_was_hit(boxes, fixed, truth.position_m, self.simulation.contact_radius_m)
         fence = self.config.safety.fence
         watch.left_fence = watch.left_fence or fence.margin_m(*truth.position_m) < 0.0
-
-    def _what_was_hit(self, truth: Motion) -> str:
-        boxes, fixed = self.simulation.boxes(), len(self.world.static_boxes)
-        position, radius = np.array(truth.position_m), self.simulation.contact_radius_m
-        nearest = min(range(len(boxes)), key=lambda i: clearance_m(boxes[i : i + 1], position, radius))
-        if nearest >= fixed:
-            return "hit_moving"
-        size = boxes[nearest, 3:] - boxes[nearest, :3]
-        return "wall" if max(size[0], size[1]) > WALL_LENGTH_M else "hit_static"
 
     def _result(self, reached_s: float, ticks: int) -> EpisodeResult:
         simulation, watch = self.simulation, self._watch
@@ -208,6 +200,16 @@ class LockstepFlight:
             mean_jerk_m_s3=mean_jerk(np.array(watch.velocities)),
             interventions=count_interventions(self.log, reached_s),
         )
+
+
+def what_was_hit(boxes: NDArray[np.float64], fixed: int, position_m: tuple[float, float, float], radius_m: float) -> str:
+    """The failure's name for a contact at `position_m`: the nearest of `boxes` [m, 6], the first `fixed` of which stand still."""
+    position = np.array(position_m)
+    nearest = min(range(len(boxes)), key=lambda i: clearance_m(boxes[i : i + 1], position, radius_m))
+    if nearest >= fixed:
+        return "hit_moving"
+    size = boxes[nearest, 3:] - boxes[nearest, :3]
+    return "wall" if max(size[0], size[1]) > WALL_LENGTH_M else "hit_static"
 
 
 def vehicle_state(motion: Motion, time_s: float) -> VehicleState:

@@ -40,8 +40,14 @@ PAPER_PATH_EFFICIENCY = "0.85"
 
 
 def read_results(folder: Path = RESULTS) -> dict[str, dict[str, Any]]:
-    """Every result file by its name without `.json`."""
-    return {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
+    """Every result file by its name without `.json`; of a file that holds several, each by name and place."""
+    results: dict[str, dict[str, Any]] = {}
+    for path in sorted(folder.glob("*.json")):
+        content = json.loads(path.read_text())
+        results |= (
+            {f"{path.stem}_{k}": one for k, one in enumerate(content)} if isinstance(content, list) else {path.stem: content}
+        )
+    return results
 
 
 def rate(p: dict[str, Any]) -> str:
@@ -56,9 +62,11 @@ def lockstep_rows(results: dict[str, dict[str, Any]], weights: str | None = None
         if "split" not in result or (weights is not None and result["weights_sha256"] != weights):
             continue
         n, split, safety = result["clean_success"]["n"], result["split"], "on" if result["safety"] else "off"
-        what = f"clean success, `{split}`, safety {safety}, lockstep: {result['description']}"
+        dynamics = result["dynamics"]
+        how, option = ("lockstep", "") if dynamics == "internal" else (f"{dynamics} dynamics", f" --dynamics {dynamics}")
+        what = f"clean success, `{split}`, safety {safety}, {how}: {result['description']}"
         figure = f"{rate(result['clean_success'])}; path efficiency {result['path_efficiency']:.3f}"
-        command = f"evaluate-policy {result['policy']} --split {split} --episodes {n} --safety {safety}"
+        command = f"evaluate-policy {result['policy']} --split {split} --episodes {n} --safety {safety}{option}"
         rows.append((what, figure, command))
     return rows
 

@@ -36,7 +36,7 @@ class EpisodeResult:
         return min(1.0, self.shortest_path_m / self.path_length_m) if self.path_length_m > 0.0 else 0.0
 
 
-FAILURES = ("hit_static", "hit_moving", "wall", "fence", "timeout", "missed_goal")
+FAILURES = ("hit_static", "hit_moving", "wall", "fence", "timeout", "missed_goal", "diverged")
 
 
 def proportion(flags: Sequence[bool]) -> dict[str, float | int]:

@@ -233,7 +233,8 @@ class VerificationRecord(_Model):
 class PolicyMetadata(_Model):
     """Everything a program needs to fly the file. Kept as JSON in the ONNX file under `METADATA_KEY`.
 
-    `memory` names the recurrent cell; `hidden_size` is 0 exactly when it is `none`, and then the graph has no state inputs.
+    `memory` names the recurrent cell; a `gru` passes c through unchanged. `hidden_size` is 0 exactly when it is `none`, and
+    then the graph has no state inputs.
     `layers`: stacked cells of `hidden_size` each; h and c are [layers, batch, hidden_size].
     """
 
@@ -242,7 +243,7 @@ class PolicyMetadata(_Model):
     observation: ObservationLayout
     action: ActionLayout
     rate_hz: float = Field(default=20.0, gt=0.0, le=1000.0)
-    memory: Literal["lstm", "none"]
+    memory: Literal["lstm", "gru", "none"]
     hidden_size: int = Field(ge=0, le=4096)
     layers: int = Field(default=1, ge=1, le=MAX_LAYERS)
     reset: ResetRules = ResetRules()

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import onnx
 
+from policy_export.errors import PolicyError
 from policy_export.graph_writer import DEFAULT_MEMORY_FORM, GraphWriter, MemoryForm, as_array
 from policy_export.network import (
     ACCELERATION_SCALE_M_S2,
@@ -28,13 +29,23 @@ if TYPE_CHECKING:
 
 
 def build_model(network: PolicyNetwork, memory_form: MemoryForm = DEFAULT_MEMORY_FORM) -> onnx.ModelProto:
-    """The ONNX model of `network`, without metadata. `memory_form`: one LSTM node, or its gates written out."""
+    """The ONNX model of `network`, without metadata. `memory_form`: one LSTM node, or its gates written out.
+
+    Raises `PolicyError` for a memory that a policy file cannot carry.
+    """
+    if network.config.memory == "stack":
+        raise PolicyError(
+            "memory `stack` is for comparison in training: a policy file carries lstm, gru or none; train one of these"
+        )
     graph = GraphWriter()
     features = _features(graph, network)
-    if network.encoder is not None:
-        memory = graph.op("Tanh", graph.linear(features, "encoder", network.encoder))
+    if network.lstm is not None:
+        memory = graph.lstm(features, [network.lstm.weights()], memory_form)
+    elif network.gru is not None:
+        memory = graph.gru(features, network.gru.weights())
     else:
-        memory = graph.lstm(features, [network.lstm_weights()], memory_form)
+        assert network.encoder is not None
+        memory = graph.op("Tanh", graph.linear(features, "encoder", network.encoder))
     _heads(graph, network, memory, features)
     return graph.model(network.config, has_value=True)
 

@@ -143,6 +143,31 @@ class GraphWriter:
         self.op("Reshape", c_out, lifted, out=outs[1])
         return h_out
 
+    def gru(self, features: str, weights: LayerWeights) -> str:
+        """One GRU layer for one step, written out, from `h_in` to `h_out` [1, B, H]; `c_in` is passed on. Returns [B, H]."""
+        w_ih, w_hh, b_ih, b_hh = (as_array(weight) for weight in weights)
+        size = w_hh.shape[1]
+        h_in = self.op("Reshape", "h_in", self.ints("state_flat", -1, size))
+        self.op("Identity", "c_in", out="c_out")
+        names = ("r", "z", "n")
+        from_x = self._gru_gates(features, "gru.input", w_ih, b_ih, names)
+        from_h = self._gru_gates(h_in, "gru.hidden", w_hh, b_hh, names)
+        r, z = (self.op("Sigmoid", self.op("Add", x, h)) for x, h in zip(from_x[:2], from_h[:2], strict=True))
+        candidate = self.op("Tanh", self.op("Add", from_x[2], self.op("Mul", r, from_h[2])))
+        kept = self.op("Mul", z, self.op("Sub", h_in, candidate))
+        h_out = self.op("Add", candidate, kept, out="gru.memory")
+        self.op("Reshape", h_out, self.ints("state_shape", 1, -1, size), out="h_out")
+        return h_out
+
+    def _gru_gates(
+        self, value: str, prefix: str, weight: NDArray[np.float32], bias: NDArray[np.float32], names: tuple[str, ...]
+    ) -> tuple[str, ...]:
+        size = weight.shape[0] // len(names)
+        weights = self.floats(f"{prefix}.weight", weight.T), self.floats(f"{prefix}.bias", bias)
+        sizes = self.ints("gru_split", *[size] * len(names))
+        outs = tuple(f"{prefix}.{name}" for name in names)
+        return self.ops("Split", self.op("Gemm", value, *weights), sizes, outs=outs, axis=1)
+
     def model(self, shape: NetworkShape, has_value: bool) -> onnx.ModelProto:
         """The finished model, checked by the onnx package, without metadata."""
         inputs, outputs = _ports(shape, has_value)

@@ -1,4 +1,4 @@
-"""The navigation network: input shaping, one LSTM layer (or none), a policy head and a value head. Needs torch.
+"""The navigation network: input shaping, a memory, a policy head and a value head. Needs torch.
 
 Observations enter in SI units as `policy_export.contract` lays them out (LiDAR ranges, goal vector, velocity, acceleration,
 yaw); every normalisation is inside the network, so that an exported file cannot be fed wrongly scaled values.
@@ -13,7 +13,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor, nn
 
-from policy_export.lstm_sequence import lstm_sequence
+from policy_export.memory import GruMemory, LstmMemory, Memory, NoMemory, StackMemory
 
 State = tuple[Tensor, Tensor]
 
@@ -33,12 +33,14 @@ class NetworkConfig(BaseModel):
     """Everything that fixes the network's shape. `to_dict` and `from_dict` are the form kept in checkpoints.
 
     `preprocessing`: `shaped` takes the closest return of each `beam_group` beams, a copy of it sharpened near contact, and
-    the goal as direction and squashed distance; `channels` only scales the raw channels, as the article does.
+    the goal as direction and squashed distance; `channels` only scales the raw channels, as the article does. `memory`:
+    `stack` sees the last `stack_frames` observations side by side, as the article's 64-step history.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    memory: Literal["lstm", "none"] = "lstm"
+    memory: Literal["lstm", "gru", "stack", "none"] = "lstm"
+    stack_frames: int = Field(default=64, ge=2, le=256)
     preprocessing: Literal["shaped", "channels"] = "shaped"
     beams: int = Field(default=180, gt=0, le=4096)
     beam_group: int = Field(default=5, gt=0)
@@ -66,12 +68,12 @@ class NetworkConfig(BaseModel):
 
     @property
     def state_size(self) -> int:
-        """Width of h and of c: `hidden_size`, or 0 without memory."""
-        return self.hidden_size if self.memory == "lstm" else 0
+        """Width of h and of c in a policy file: `hidden_size`, or 0 without memory."""
+        return self.hidden_size if self.memory in {"lstm", "gru"} else 0
 
     @property
     def layers(self) -> int:
-        """Stacked LSTM layers; this network has one."""
+        """Stacked recurrent layers; this network has one."""
         return 1
 
     @property
@@ -99,7 +101,7 @@ class NetworkConfig(BaseModel):
 class PolicyNetwork(nn.Module):
     """Actor and critic over one shared memory.
 
-    Shapes: observations [B, 190]; states h, c [1, B, H] (H is 0 without memory); means [B, 4] before tanh; values [B].
+    Shapes: observations [B, 190]; states h, c [1, B, W] with the memory's widths W; means [B, 4] before tanh; values [B].
     """
 
     action_low: Tensor
@@ -108,9 +110,10 @@ class PolicyNetwork(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        self.lstm = nn.LSTM(config.feature_size, config.hidden_size) if config.memory == "lstm" else None
-        # A feed-forward network gets a hidden layer of the memory's width, so that both have similar capacity.
-        self.encoder = None if self.lstm is not None else nn.Linear(config.feature_size, config.hidden_size)
+        memory = _make_memory(config)
+        self.lstm = memory if isinstance(memory, LstmMemory) else None
+        self.gru = memory if isinstance(memory, GruMemory) else None
+        self.encoder = memory if isinstance(memory, NoMemory | StackMemory) else None
         head_input = config.hidden_size + (config.feature_size if config.feature_skip else 0)
         self.policy_head = nn.Sequential(nn.Linear(head_input, config.head_size), nn.Tanh(), nn.Linear(config.head_size, 4))
         self.value_head = nn.Sequential(nn.Linear(head_input, config.head_size), nn.Tanh(), nn.Linear(config.head_size, 1))
@@ -128,12 +131,19 @@ class PolicyNetwork(nn.Module):
             last = head[-1]
             assert isinstance(last, nn.Linear)
             nn.init.orthogonal_(last.weight, gain=gain)
-        if self.lstm is not None:
-            for name, parameter in self.lstm.named_parameters():
+        if self.encoder is None:
+            for name, parameter in self.memory.named_parameters():
                 if name.startswith("weight"):
                     nn.init.orthogonal_(parameter)
                 else:
                     nn.init.zeros_(parameter)
+
+    @property
+    def memory(self) -> Memory:
+        """The memory; its weights are stored under its kind."""
+        memory = self.lstm or self.gru or self.encoder
+        assert memory is not None
+        return memory
 
     def observation_spread(self) -> None:
         """Mean and deviation of training's observations: unknown, the network scales them by fixed numbers."""
@@ -141,8 +151,8 @@ class PolicyNetwork(nn.Module):
 
     def initial_state(self, batch: int) -> State:
         """Zero h and c [1, batch, H] in the network's own type and device."""
-        zeros = self.action_low.new_zeros(1, batch, self.config.state_size)
-        return zeros, zeros.clone()
+        h, c = (self.action_low.new_zeros(1, batch, width) for width in self.memory.widths)
+        return h, c
 
     def features(self, obs: Tensor) -> Tensor:
         """Observations [..., 190] in SI units to features [..., F] of order one."""
@@ -171,47 +181,39 @@ class PolicyNetwork(nn.Module):
 
     def heads(self, memory: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
         """Memory [..., H] and features [..., F] to means [..., 4] and values [...]."""
-        joined = torch.cat((memory, features), dim=-1) if self.config.feature_skip else memory
+        joined = self.join(memory, features)
         return self.policy_head(joined), self.value_head(joined).squeeze(-1)
+
+    def join(self, memory: Tensor, features: Tensor) -> Tensor:
+        """What both heads read: memory [..., H], with the features [..., F] beside it if the network is built so."""
+        return torch.cat((memory, features), dim=-1) if self.config.feature_skip else memory
 
     def step(self, obs: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """One decision for a batch: (mean [B, 4] before tanh, value [B], h', c' [1, B, H])."""
         features = self.features(obs)
-        if self.lstm is None:
-            mean, value = self.heads(self.encode(features), features)
-            return mean, value, h, c
-        h_next, c_next = self.cell(features, h[0], c[0])
-        mean, value = self.heads(h_next, features)
+        memory, h_next, c_next = self.memory.step(features, h[0], c[0])
+        mean, value = self.heads(memory, features)
         return mean, value, h_next.unsqueeze(0), c_next.unsqueeze(0)
 
-    def cell(self, features: Tensor, h: Tensor, c: Tensor) -> State:
-        """The LSTM's equations written out for one step: features [B, F], h, c [B, H]."""
-        weight_ih, weight_hh, bias_ih, bias_hh = self.lstm_weights()
-        gates = nn.functional.linear(features, weight_ih, bias_ih + bias_hh) + nn.functional.linear(h, weight_hh)
-        i, f, g, o = gates.chunk(4, dim=-1)
-        c_next = torch.sigmoid(f) * c + torch.sigmoid(i) * torch.tanh(g)
-        return torch.sigmoid(o) * torch.tanh(c_next), c_next
-
-    def encode(self, features: Tensor) -> Tensor:
-        """The hidden layer that stands in for the memory in a feed-forward network."""
-        assert self.encoder is not None
-        return torch.tanh(self.encoder(features))
-
-    def lstm_weights(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """w_ih [4H, F], w_hh [4H, H], b_ih [4H], b_hh [4H], gate order i, f, g, o."""
-        assert self.lstm is not None
-        weight_ih, weight_hh, bias_ih, bias_hh = self.lstm.parameters()
-        return weight_ih, weight_hh, bias_ih, bias_hh
-
     def sequence(self, obs: Tensor, h0: Tensor, c0: Tensor, reset: Tensor) -> tuple[Tensor, Tensor, State]:
-        """Whole sequences: obs [T, B, 190], h0, c0 [1, B, H], reset [T, B] (state zeroed before step t where true).
+        """Whole sequences: obs [T, B, 190], h0, c0 [1, B, W], reset [T, B] (state zeroed before step t where true).
 
         Returns means [T, B, 4] before tanh, values [T, B] and the last state. Differentiable in everything but `reset`.
         """
         features = self.features(obs)
-        if self.lstm is None:
-            mean, value = self.heads(self.encode(features), features)
-            return mean, value, (h0, c0)
-        output, (h, c) = lstm_sequence(features, self.lstm_weights(), (h0[0], c0[0]), reset)
-        mean, value = self.heads(output, features)
+        memory, h, c = self.memory.sequence(features, h0[0], c0[0], reset)
+        mean, value = self.heads(memory, features)
         return mean, value, (h.unsqueeze(0), c.unsqueeze(0))
+
+
+def _make_memory(config: NetworkConfig) -> Memory:
+    features, hidden = config.feature_size, config.hidden_size
+    match config.memory:
+        case "lstm":
+            return LstmMemory(features, hidden)
+        case "gru":
+            return GruMemory(features, hidden)
+        case "stack":
+            return StackMemory(features, hidden, config.stack_frames)
+        case "none":
+            return NoMemory(features, hidden)

@@ -62,7 +62,7 @@ def expected_ports(metadata: PolicyMetadata) -> tuple[dict[str, tuple[int | None
     """Names and shapes that the graph must have; None is the batch axis."""
     inputs: dict[str, tuple[int | None, ...]] = {"obs": (None, metadata.observation.size)}
     outputs: dict[str, tuple[int | None, ...]] = {"action": (None, metadata.action.size)}
-    if metadata.memory == "lstm":
+    if metadata.memory != "none":
         state = (metadata.layers, None, metadata.hidden_size)
         inputs |= {"h_in": state, "c_in": state}
         outputs |= {"h_out": state, "c_out": state}

@@ -31,6 +31,15 @@ def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
 
 def load_checkpoint(path: Path, resume: bool = False) -> dict[str, Any]:
     """Read a checkpoint; with ``resume`` also demand the optimiser and generator states. Raises CheckpointError."""
+    content = load_plain(path)
+    missing = [key for key in EXPORT_KEYS + (RESUME_KEYS if resume else ()) if key not in content]
+    if missing:
+        raise CheckpointError(f"{path}: lacks {', '.join(missing)}; it was not written by train-policy")
+    return content
+
+
+def load_plain(path: Path) -> dict[str, Any]:
+    """Read any file that ``save_checkpoint`` wrote. Raises CheckpointError."""
     if not path.is_file():
         raise CheckpointError(f"{path}: no such checkpoint; give a run folder that holds last.pt")
     try:
@@ -45,11 +54,9 @@ def load_checkpoint(path: Path, resume: bool = False) -> dict[str, Any]:
         UnpicklingError,
     ) as error:
         raise CheckpointError(f"{path}: not a readable checkpoint ({str(error).splitlines()[0]})") from None
-    needed = EXPORT_KEYS + (RESUME_KEYS if resume else ())
-    missing = [key for key in needed if not isinstance(content, dict) or key not in content]
-    if missing:
-        raise CheckpointError(f"{path}: lacks {', '.join(missing)}; it was not written by train-policy")
-    return dict(content)
+    if not isinstance(content, dict):
+        raise CheckpointError(f"{path}: not a checkpoint; it was not written by train-policy")
+    return content
 
 
 def to_plain(value: Any) -> Any:

@@ -13,7 +13,8 @@ import typer
 
 if TYPE_CHECKING:
     from training.config import TrainingConfig
-    from training.trainer import Status, Trainer
+    from training.recorder import Status
+    from training.trainer import Trainer
 
 _EPILOG = """
 Examples:
@@ -23,6 +24,8 @@ train-policy --config configs/training/ppo_lstm.yaml
 train-policy --config configs/training/ppo_lstm.yaml --out runs/night --seed 3 --decisions 5e6
 
 train-policy --resume runs/night
+
+torchrun --nproc-per-node 2 -m training.cli --config configs/training/ppo_lstm.yaml
 """
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
@@ -39,6 +42,7 @@ def train(
     resume: Annotated[Path | None, typer.Option(help="Go on with the run in this folder, from its last.pt.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Replaces the preset's seed.")] = None,
     decisions: Annotated[float | None, typer.Option(min=1, help="Replaces the preset's number of decisions.")] = None,
+    memory: Annotated[str | None, typer.Option(help="Replaces the preset's memory: lstm, gru, stack or none.")] = None,
     device: Annotated[str, typer.Option(help="Torch device of the network.")] = "cpu",
     threads: Annotated[int, typer.Option(min=1, help="Torch threads; more than 1 rarely helps at this size.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object with the result on stdout.")] = False,
@@ -53,14 +57,15 @@ def train(
     from training.ppo import TrainingDivergedError
 
     try:
-        result = _run(config, out, resume, {"seed": seed, "decisions": decisions and int(decisions)}, device, threads)
+        changes = {"seed": seed, "decisions": decisions and int(decisions), "memory": memory}
+        result = _run(config, out, resume, changes, device, threads)
     except (_UsageError, ConfigError, CheckpointError) as error:
         _fail(str(error), 2)
     except KeyboardInterrupt:
         _fail("stopped at once; the last checkpoint is good", 130)
     except TrainingDivergedError as error:
         _fail(f"training diverged: {error}; the last checkpoint is good", 1)
-    if as_json:
+    if as_json and result.pop("leads"):
         print(json.dumps(result))
 
 
@@ -79,17 +84,32 @@ def _run(
     torch.set_num_threads(threads)
     settings, folder = _settings(config, out, resume, changes)
     _check_device(device)
+    from training.team import join, leave
     from training.trainer import Trainer
 
-    trainer = Trainer(settings, folder, device)
-    if resume is not None:
-        trainer.resume(resume / "last.pt")
-    interrupted = _train(trainer)
-    print(f"{'stopped' if interrupted else 'done'}: {folder}/last.pt after {trainer.decisions:,} decisions", file=sys.stderr)
+    team, device = join(device)
+    _check_shares(settings, team.size)
+    try:
+        trainer = Trainer(settings, folder, device, team)
+        if resume is not None:
+            trainer.resume(resume / "last.pt")
+        interrupted = _train(trainer)
+    finally:
+        leave(team)
+    if team.leads:
+        print(f"{'stopped' if interrupted else 'done'}: {folder}/last.pt after {trainer.decisions:,} decisions", file=sys.stderr)
     return {
         "run": str(folder), "decisions": trainer.decisions, "seconds": round(trainer.seconds, 1), "finished": not interrupted,
-        "best_success": trainer.best if trainer.best >= 0.0 else None, "evaluation": trainer.evaluation,
+        "best_success": trainer.best if trainer.best >= 0.0 else None, "evaluation": trainer.evaluation, "leads": team.leads,
     }  # fmt: skip
+
+
+def _check_shares(settings: TrainingConfig, processes: int) -> None:
+    parts = processes * settings.ppo.minibatches
+    if settings.ppo.environments % parts:
+        raise _UsageError(
+            f"ppo.environments ({settings.ppo.environments}) must be a multiple of processes x minibatches ({parts})"
+        )
 
 
 def _settings(config: Path | None, out: Path | None, resume: Path | None, changes: dict[str, Any]) -> tuple[TrainingConfig, Path]:
@@ -106,14 +126,16 @@ def _settings(config: Path | None, out: Path | None, resume: Path | None, change
             raise _UsageError(f"{folder} already holds a run: go on with --resume {folder}, or give another --out")
     else:
         assert resume is not None
-        if changes["seed"] is not None:
-            raise _UsageError("--seed belongs to a new run; a resumed one keeps its own")
+        for name in ("seed", "memory"):
+            if changes[name] is not None:
+                raise _UsageError(f"--{name} belongs to a new run; a resumed one keeps its own")
         base, folder = _stored_config(load_checkpoint(resume / "last.pt", resume=True), resume), out or resume
     try:
         merged = base.model_dump() | {key: value for key, value in changes.items() if value is not None}
         return TrainingConfig.model_validate(merged), folder
     except ValidationError as error:
-        raise _UsageError(str(error.errors()[0]["msg"])) from None
+        first = error.errors()[0]
+        raise _UsageError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
 def _stored_config(content: dict[str, Any], folder: Path) -> TrainingConfig:
@@ -144,13 +166,15 @@ def _train(trainer: Trainer) -> bool:
     console = Console(stderr=True)
     columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), TextColumn("ETA"), TimeRemainingColumn())
     stop = _StopRequest()
-    with Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=120.0) as progress, stop:
+    quiet = not (console.is_terminal and trainer.team.leads)
+    with Progress(*columns, console=console, disable=quiet, speed_estimate_period=120.0) as progress, stop:
         task = progress.add_task("starting", total=trainer.config.decisions, completed=trainer.decisions)
         for status in trainer.updates():
             progress.update(task, completed=status.decisions, description=_describe(status))
-            _log(console, trainer, status)
-            if stop.requested:
-                trainer.save("last.pt")
+            if trainer.team.leads:
+                _log(console, trainer, status)
+            if trainer.team.mean(stop.requested) > 0.0:  # all processes end at the same update
+                trainer.save()
                 break
     return trainer.decisions < trainer.config.decisions
 

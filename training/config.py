@@ -81,7 +81,8 @@ class EnvironmentConfig(StrictModel):
     moving_share: float = Field(default=0.0, ge=0, le=1, description="share of corridors with moving pillars")
     moving_pillars: tuple[int, int] = (2, 4)
     mover_speed_max_mps: float = Field(default=0.5, gt=0)
-    world_pool: int = Field(default=2048, ge=1, le=65536, description="corridors kept ready; replaced steadily by new ones")
+    world_pool: int = Field(default=2048, ge=1, le=65536, description="corridors kept ready")
+    world_renewal_episodes: int = Field(default=4, ge=1, description="after so many episodes the oldest corridor is replaced")
     vehicle: VehicleRandomisation = VehicleRandomisation()
     estimate: EstimateRandomisation = EstimateRandomisation()
     reward: RewardConfig = RewardConfig()
@@ -100,6 +101,9 @@ class PpoConfig(StrictModel):
     environments: int = Field(default=256, ge=1)
     steps: int = Field(
         default=64, ge=1, description="decisions per environment and update; the length of back-propagation through time"
+    )
+    sequence: int | None = Field(
+        default=None, ge=1, description="cut rollouts into sequences of so many decisions to learn from; null: not at all"
     )
     epochs: int = Field(default=4, ge=1)
     minibatches: int = Field(default=4, ge=1)
@@ -120,6 +124,8 @@ class PpoConfig(StrictModel):
     def _check(self) -> Self:
         if self.environments % self.minibatches:
             raise ValueError("environments must be a multiple of minibatches: minibatches are whole sequences")
+        if self.steps % (self.sequence or self.steps):
+            raise ValueError("steps must be a multiple of sequence: a rollout is cut into whole sequences")
         if not self.hold or self.hold[0].share != 0.0 or list(self.hold) != sorted(self.hold, key=lambda stage: stage.share):
             raise ValueError("hold must start at share 0.0 and have increasing shares")
         return self
@@ -139,10 +145,10 @@ class TrainingConfig(StrictModel):
 
     seed: int = Field(default=1, ge=0)
     decisions: int = Field(default=30_000_000, ge=1)
-    checkpoint_every_updates: int = Field(default=10, ge=1)
+    checkpoint_every_updates: int = Field(default=1, ge=1, description="a killed run loses at most so many updates")
     environment: EnvironmentConfig = EnvironmentConfig()
     network: dict[str, Any] = Field(default_factory=dict, description="overrides of policy_export.network.NetworkConfig")
-    memory: Literal["lstm", "none"] = "lstm"
+    memory: Literal["lstm", "gru", "stack", "none"] = "lstm"
     layout: Literal["default", "paper"] = "default"
     ppo: PpoConfig = PpoConfig()
     evaluation: EvaluationConfig = EvaluationConfig()

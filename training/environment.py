@@ -84,7 +84,7 @@ class CorridorVectorEnv(VectorEnv):
         self.arena.active[:] = True
         for i in range(self.num_envs):
             self._begin(i)
-        return self._observations.copy(), {}
+        return self.last_observations, {}
 
     def step(
         self, actions: NDArray[np.float32]
@@ -96,17 +96,31 @@ class CorridorVectorEnv(VectorEnv):
         self, actions: NDArray[np.float32], hold: int
     ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """One decision held for ``hold`` ticks (turned by the new yaw at every tick). Raises ValueError on NaN actions."""
-        clipped = np.clip(np.asarray(actions, dtype=np.float64), self._low, self._high)
-        if not np.isfinite(clipped).all():
-            raise ValueError("actions hold NaN")
-        kernels.step_all(self.arena, self.rules, clipped, hold, self.rng, self._observations, self._rewards)
+        self.decide(actions, hold)
         outcome = np.where(self.arena.active, self.arena.outcome, kernels.RUNNING)
         truncated = outcome == kernels.TIME_OUT
         terminated = (outcome != kernels.RUNNING) & ~truncated
         info = self._episode_info(outcome)
         for i in np.flatnonzero(outcome):
             self._begin(int(i))
-        return self._observations.copy(), self._rewards.copy(), terminated, truncated, info
+        return self.last_observations, self.last_rewards, terminated, truncated, info
+
+    def decide(self, actions: NDArray[np.floating[Any]], hold: int) -> None:
+        """`step_held` without its answer and without new episodes: the state is then in ``arena``. Raises ValueError on NaN."""
+        clipped = np.clip(np.asarray(actions, dtype=np.float64), self._low, self._high)
+        if not np.isfinite(clipped).all():
+            raise ValueError("actions hold NaN")
+        kernels.step_all(self.arena, self.rules, clipped, hold, self.rng, self._observations, self._rewards)
+
+    @property
+    def last_observations(self) -> NDArray[np.float32]:
+        """A copy of the newest observations [N, 190]."""
+        return self._observations.copy()
+
+    @property
+    def last_rewards(self) -> NDArray[np.float64]:
+        """A copy of the rewards [N] of the last decision."""
+        return self._rewards.copy()
 
     def _episode_info(self, outcome: NDArray[np.int64]) -> dict[str, Any]:
         arena, ended = self.arena, np.flatnonzero(outcome)
@@ -116,6 +130,7 @@ class CorridorVectorEnv(VectorEnv):
             "ended": ended,
             "outcomes": [kernels.OUTCOME_NAMES[outcome[i]] for i in ended],
             "episode_ticks": arena.ticks[ended].tolist(),
+            "episode_return": arena.episode[ended, kernels.RETURN].tolist(),
             "path_length_m": arena.episode[ended, kernels.PATH_LENGTH].tolist(),
             "min_clearance_m": arena.episode[ended, kernels.MIN_CLEARANCE].tolist(),
         }
@@ -185,7 +200,7 @@ class CorridorVectorEnv(VectorEnv):
         self.rng.bit_generator.state = state["rng"]
         self._observations[...] = np.asarray(state["observations"])
         if isinstance(self.worlds, WorldPool):
-            self.worlds.restore(np.asarray(state["pool"]["seeds"]), state["pool"]["oldest"])
+            self.worlds.restore(state["pool"])
 
 
 def make_rules(config: EnvironmentConfig, layout: ObservationLayout, action: ActionLayout) -> Rules:

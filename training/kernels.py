@@ -48,8 +48,8 @@ TERM_NAMES = (
 )  # fmt: skip
 
 # columns of `Arena.episode`
-DISTANCE, MIN_CLEARANCE, PATH_LENGTH, LAST_VELOCITY = range(4)  # the last one is three columns wide
-EPISODE_COLUMNS = 6
+DISTANCE, MIN_CLEARANCE, PATH_LENGTH, RETURN, LAST_VELOCITY = range(5)  # the last one is three columns wide
+EPISODE_COLUMNS = 7
 
 
 class Rules(NamedTuple):
@@ -300,6 +300,7 @@ def begin_episode(arena: Arena, rules: Rules, i: int, rng: np.random.Generator, 
     arena.episode[i, DISTANCE] = _distance(arena.vehicle[i, 0:3], arena.goal[i])
     arena.episode[i, MIN_CLEARANCE] = np.inf
     arena.episode[i, PATH_LENGTH] = 0.0
+    arena.episode[i, RETURN] = 0.0
     arena.episode[i, LAST_VELOCITY : LAST_VELOCITY + 3] = arena.vehicle[i, 3:6]
     _move_boxes(arena, i, 0.0)
     scan_into(arena, rules, i, rng)
@@ -324,3 +325,4 @@ def step_all(
         for k in range(arena.terms.shape[1]):
             arena.terms[i, k] *= rules.scale
             rewards[i] += arena.terms[i, k]
+        arena.episode[i, RETURN] += rewards[i]

@@ -15,9 +15,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from policy_export.lstm_sequence import lstm_sequence
+from policy_export.memory import LstmMemory
 from policy_export.network import PolicyNetwork
 from training.config import PpoConfig
+from training.fast_lstm import fast_lstm_sequence
+from training.team import Team
 
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 # Beyond this |mean| a tanh is flat: means are pulled back so that gradients stay alive.
@@ -61,16 +63,12 @@ def advantages(
     step. ``decay`` is (gamma, lambda) per decision.
     """
     gamma, lam = decay
-    result = torch.zeros_like(rewards)
-    running = torch.zeros_like(last_value)
-    following = last_value
-    for t in range(rewards.shape[0] - 1, -1, -1):
-        ended = terminated[t] | truncated[t]
-        next_value = torch.where(ended, torch.where(truncated[t], final_values[t], torch.zeros_like(following)), following)
-        delta = rewards[t] + gamma * next_value - values[t]
-        running = delta + gamma * lam * torch.where(ended, torch.zeros_like(running), running)
-        result[t] = running
-        following = values[t]
+    following = torch.cat((values[1:], last_value.unsqueeze(0)))
+    next_value = torch.where(truncated, final_values, torch.where(terminated, torch.zeros_like(following), following))
+    result = rewards + gamma * next_value - values  # temporal differences, summed up from the end
+    carried = gamma * lam * (~(terminated | truncated)).to(rewards.dtype)
+    for t in range(rewards.shape[0] - 2, -1, -1):
+        result[t].addcmul_(carried[t], result[t + 1])
     return result, result + values
 
 
@@ -97,20 +95,23 @@ class Batch:
 
 def evaluate_sequences(network: PolicyNetwork, features: Tensor, h0: Tensor, c0: Tensor, reset: Tensor) -> tuple[Tensor, Tensor]:
     """Means [T, B, 4] and values [T, B] of whole sequences of features, with gradients."""
-    if network.lstm is None:
-        return network.heads(network.encode(features), features)
-    memory, _ = lstm_sequence(features, network.lstm_weights(), (h0, c0), reset)
-    return network.heads(memory, features)
+    memory = network.memory
+    if isinstance(memory, LstmMemory):
+        output, _, _ = fast_lstm_sequence(memory, features, h0, c0, reset)
+    else:
+        output, _, _ = memory.sequence(features, h0, c0, reset)
+    return network.heads(output, features)
 
 
 class PpoLearner:
     """Owns the optimiser and the adaptive learning rate."""
 
-    def __init__(self, network: PolicyNetwork, config: PpoConfig) -> None:
+    def __init__(self, network: PolicyNetwork, config: PpoConfig, team: Team | None = None) -> None:
         self.network = network
         self.config = config
+        self.team = team or Team()
         self.learning_rate = config.learning_rate
-        self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, eps=1e-5)
+        self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, eps=1e-5, fused=True)
 
     def update(self, batch: Batch, generator: torch.Generator, progress: float) -> dict[str, float]:
         """All epochs over one rollout; ``progress`` 0..1 is the share of training done. Returns the mean of each metric.
@@ -127,7 +128,7 @@ class PpoLearner:
                 for name, value in metrics.items():
                     sums[name] = sums.get(name, 0.0) + value
                 count += 1
-            kl = sum(kls) / len(kls)
+            kl = self.team.mean(sum(kls) / len(kls))
             if self.config.target_kl is not None and kl > _STOP_AT_KL * self.config.target_kl:
                 break
         self._adapt(kl, progress)
@@ -141,11 +142,11 @@ class PpoLearner:
         loss, metrics = self._loss(batch, progress)
         self.optimizer.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
+        self.team.average([parameter.grad for parameter in self.network.parameters() if parameter.grad is not None])
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.max_grad_norm)
-        if not torch.isfinite(loss) or not torch.isfinite(norm):
-            raise TrainingDivergedError(
-                f"loss {loss.item():g}, gradient norm {norm.item():g}: lower ppo.learning_rate and resume"
-            )
+        mean_loss = self.team.mean(loss.item())
+        if not (math.isfinite(mean_loss) and torch.isfinite(norm)):
+            raise TrainingDivergedError(f"loss {mean_loss:g}, gradient norm {norm.item():g}: lower ppo.learning_rate and resume")
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
         self.optimizer.step()

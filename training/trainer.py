@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,14 @@ import torch
 
 from policy_export.contract import ActionLayout, ObservationLayout, default_layout, paper_layout
 from policy_export.network import NetworkConfig, PolicyNetwork
-from training.checkpoint import load_checkpoint, save_checkpoint, to_plain
+from training.checkpoint import CheckpointError, load_checkpoint, load_plain, save_checkpoint, to_plain
 from training.config import PpoConfig, TrainingConfig
 from training.environment import CorridorVectorEnv
 from training.evaluation import evaluate, evaluation_environment
 from training.ppo import PpoLearner
+from training.recorder import Recorder, Status
 from training.rollout import RolloutCollector, RolloutSummary
+from training.team import Team
 
 _RECENT_EPISODES = 500
 
@@ -47,32 +48,23 @@ def git_commit() -> str:
     return done.stdout.strip() if done.returncode == 0 else "unknown"
 
 
-@dataclass(slots=True)
-class Status:
-    """What a display wants to know after each update."""
-
-    decisions: int
-    total: int
-    decisions_per_s: float
-    hold: int
-    success: float
-    contacts: float
-    evaluation: dict[str, Any] | None
-    metrics: dict[str, float]
-
-
 class Trainer:
-    """One run in one folder. ``updates`` yields after every update; stopping the iteration at any point loses nothing saved."""
+    """One run in one folder. ``updates`` yields after every update; stopping the iteration at any point loses nothing saved.
 
-    def __init__(self, config: TrainingConfig, out: Path, device: str = "cpu") -> None:
-        self.config, self.out = config, out
+    In a ``team`` of several processes each has a share of the environments; the first one evaluates, records and saves.
+    """
+
+    def __init__(self, config: TrainingConfig, out: Path, device: str = "cpu", team: Team | None = None) -> None:
+        self.config, self.out, self.team = config, out, team or Team()
         torch.manual_seed(config.seed)
-        self.generator = torch.Generator().manual_seed(config.seed)
+        seed = self.team.seed(config.seed)
+        self.generator = torch.Generator().manual_seed(seed)
         self.layout, self.action_layout = layouts(config)
         limits = {"action_low": self.action_layout.low, "action_high": self.action_layout.high}
         self.network = PolicyNetwork(NetworkConfig(**({"memory": config.memory} | limits | config.network))).to(device)
-        self.learner = PpoLearner(self.network, config.ppo)
-        self.env = CorridorVectorEnv(config.ppo.environments, config.environment, config.seed, self.layout, self.action_layout)
+        self.learner = PpoLearner(self.network, config.ppo, self.team)
+        share = config.ppo.environments // self.team.size
+        self.env = CorridorVectorEnv(share, config.environment, seed, self.layout, self.action_layout)
         self.collector = RolloutCollector(self.env, self.network, config.ppo, self.generator)
         self.decisions = self.update_count = 0
         self.seconds = 0.0
@@ -91,26 +83,28 @@ class Trainer:
     def updates(self) -> Iterator[Status]:
         """Train until ``config.decisions`` are done. Raises TrainingDivergedError with the last checkpoint intact."""
         self.out.mkdir(parents=True, exist_ok=True)
-        with _Recorder(self.out, self.decisions) as recorder:
+        with Recorder(self.out, self.decisions) if self.team.leads else nullcontext() as recorder:
             while self.decisions < self.config.decisions:
                 status = self._one_update()
-                recorder.write(self, status)
+                if recorder is not None:
+                    recorder.write(self.update_count, self.seconds, status)
                 yield status
-            self.save("last.pt")
+            self.save()
 
     def _one_update(self) -> Status:
         began = time.perf_counter()
         hold = hold_ticks(self.config.ppo, self.progress)
         batch, summary = self.collector.collect(hold)
         metrics = self.learner.update(batch, self.generator, self.progress)
-        self.decisions += summary.decisions
+        self.decisions += summary.decisions * self.team.size
         self.update_count += 1
         self.seconds += (elapsed := time.perf_counter() - began)
         fresh = None
         if self.decisions >= self.next_evaluation or self.decisions >= self.config.decisions:
-            fresh = self._evaluate()
+            self.next_evaluation = self.decisions + self.config.evaluation.every_decisions
+            fresh = self._evaluate() if self.team.leads else None
         if self.update_count % self.config.checkpoint_every_updates == 0:
-            self.save("last.pt")
+            self.save()
         return self._status(summary, metrics, hold, elapsed, fresh)
 
     def _evaluate(self) -> dict[str, Any]:
@@ -118,10 +112,9 @@ class Trainer:
         if self._evaluation_env is None:
             self._evaluation_env = evaluation_environment(config.environment, config.evaluation, self.layout, self.action_layout)
         self.evaluation = evaluate(self.network, self._evaluation_env)
-        self.next_evaluation = self.decisions + config.evaluation.every_decisions
         if self.evaluation["success"] >= self.best:
             self.best = self.evaluation["success"]
-            self.save("best.pt")
+            save_checkpoint(self.out / "best.pt", self._content())
         return self.evaluation
 
     def _status(
@@ -134,88 +127,64 @@ class Trainer:
         contacts = sum(1 for outcome in self._recent if outcome not in ("goal", "time_out")) / total
         metrics = metrics | {f"reward/{name}": value / summary.decisions for name, value in summary.reward_terms.items()}
         metrics |= {f"std/{i}": value for i, value in enumerate(self.network.log_std.detach().exp().tolist())}
-        metrics["mean_episode_ticks"] = sum(summary.episode_ticks) / max(len(summary.episode_ticks), 1)
-        speed = summary.decisions / elapsed
-        return Status(self.decisions, self.config.decisions, speed, hold, success, contacts, evaluation, metrics)
+        speed = self.team.size * summary.decisions / elapsed
+        episodes = len(summary.episode_ticks)
+        if episodes:
+            metrics["mean_return"] = sum(summary.returns) / episodes / self.config.environment.reward.scale
+            metrics["mean_episode_ticks"] = sum(summary.episode_ticks) / episodes
+        return Status(
+            self.decisions, self.config.decisions, speed, hold, success, contacts, evaluation, metrics, dict(summary.outcomes)
+        )
 
-    def save(self, name: str) -> None:
-        """Write a checkpoint that both the exporter and ``resume`` read."""
+    def save(self) -> None:
+        """Write last.pt, which both the exporter and ``resume`` read, once the other processes have written their parts."""
+        if not self.team.leads:
+            save_checkpoint(self._part(), to_plain(self._own_state()))
+        self.team.wait()
+        if self.team.leads:
+            save_checkpoint(self.out / "last.pt", self._content())
+        self.team.wait()
+        for old in set(self.out.glob(f"last.{self.team.rank}-*.pt")) - {self._part()}:
+            old.unlink()
+
+    def _part(self) -> Path:
+        """Where a process that does not lead keeps its own state of this update."""
+        return self.out / f"last.{self.team.rank}-{self.update_count}.pt"
+
+    def _own_state(self) -> dict[str, Any]:
+        """What every process has of its own."""
+        return {"generator": self.generator.get_state(), "collector": self.collector.state(), "environment": self.env.state()}
+
+    def _content(self) -> dict[str, Any]:
         config, learner, network = self.config, self.learner, self.network
         training = {"config_hash": config.digest(), "seed": config.seed, "steps": self.decisions, "git_commit": self.commit}
         training |= {"updates": self.update_count, "seconds": round(self.seconds, 1), "evaluation": self.evaluation or {}}
         resume = {"config": config.model_dump(mode="json"), "best": self.best, "next_evaluation": self.next_evaluation}
-        resume |= {"seconds": self.seconds, "learning_rate": learner.learning_rate, "generator": self.generator.get_state()}
-        resume |= {"collector": self.collector.state(), "environment": self.env.state(), "recent": list(self._recent)}
+        resume |= {"seconds": self.seconds, "learning_rate": learner.learning_rate, "processes": self.team.size}
+        resume |= {"recent": list(self._recent), **self._own_state()}
         layout = {"observation": self.layout.model_dump(mode="json"), "action": self.action_layout.model_dump(mode="json")}
         content = {"network_config": network.config.to_dict(), "state_dict": _on_cpu(network.state_dict()), "training": training}
         content |= {"layout": layout, "optimizer": learner.optimizer.state_dict(), "resume": resume}
-        save_checkpoint(self.out / name, to_plain(content))
+        return dict(to_plain(content))
 
     def resume(self, path: Path) -> None:
-        """Go on from a checkpoint of a run with the same configuration."""
+        """Go on from a checkpoint of a run with the same configuration and as many processes."""
         content = load_checkpoint(path, resume=True)
         saved = content["resume"]
+        if (processes := saved.get("processes", 1)) != self.team.size:
+            raise CheckpointError(f"{path}: was trained by {processes} processes; torchrun that many to go on with it")
         self.network.load_state_dict(content["state_dict"])
         self.learner.optimizer.load_state_dict(content["optimizer"])
         self.learner.learning_rate = saved["learning_rate"]
-        self.generator.set_state(saved["generator"])
-        self.collector.restore(saved["collector"])
-        self.env.restore(saved["environment"])
         self.decisions, self.update_count = content["training"]["steps"], content["training"]["updates"]
         self.evaluation = content["training"]["evaluation"] or None
         self.best, self.next_evaluation, self.seconds = saved["best"], saved["next_evaluation"], saved["seconds"]
         self._recent.extend(saved["recent"])
+        own = saved if self.team.leads else load_plain(path.parent / self._part().name)
+        self.generator.set_state(own["generator"])
+        self.collector.restore(own["collector"])
+        self.env.restore(own["environment"])
 
 
 def _on_cpu(weights: dict[str, Any]) -> dict[str, Any]:
     return {name: tensor.cpu() for name, tensor in weights.items()}
-
-
-def _forget_after(path: Path, decisions: int) -> None:
-    """Drop the rows of updates that a resumed run will repeat, and a torn last line."""
-    if not path.exists():
-        return
-    kept = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            if json.loads(line)["decisions"] <= decisions:
-                kept.append(line + "\n")
-        except ValueError:
-            continue
-    path.write_text("".join(kept), encoding="utf-8")
-
-
-class _Recorder:
-    """Metrics of every update to ``metrics.jsonl`` and TensorBoard."""
-
-    def __init__(self, out: Path, decisions: int) -> None:
-        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  # slow import
-
-        path = out / "metrics.jsonl"
-        _forget_after(path, decisions)
-        self._file = path.open("a", encoding="utf-8")
-        self._board = SummaryWriter(str(out / "tensorboard"), purge_step=decisions + 1)
-
-    def __enter__(self) -> _Recorder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-        self._board.close()
-
-    def write(self, trainer: Trainer, status: Status) -> None:
-        """One line, one TensorBoard step."""
-        row: dict[str, Any] = {
-            "decisions": status.decisions,
-            "update": trainer.update_count,
-            "seconds": round(trainer.seconds, 2),
-        }
-        row |= {"hold": status.hold, "decisions_per_s": round(status.decisions_per_s, 1)}
-        row |= {"success": status.success, "contacts": status.contacts} | status.metrics
-        for name, value in row.items():
-            self._board.add_scalar(name, value, status.decisions)
-        if status.evaluation is not None:
-            row["evaluation"] = status.evaluation
-            self._board.add_scalar("evaluation/success", status.evaluation["success"], status.decisions)
-        self._file.write(json.dumps(row) + "\n")
-        self._file.flush()

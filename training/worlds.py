@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,29 +46,42 @@ class FixedWorlds:
         return self._worlds[environment % len(self._worlds)]
 
 
+class FreshWorlds:
+    """A new corridor from the training seeds for every episode."""
+
+    def __init__(self, config: EnvironmentConfig) -> None:
+        self._config = config
+
+    def next_world(self, environment: int, rng: np.random.Generator) -> World:
+        """See WorldSource."""
+        return world_for_seed(int(rng.integers(TRAINING_SEED_START, EVALUATION_SEED_START)), self._config)
+
+
 class WorldPool:
-    """``world_pool`` corridors drawn from the training seeds; the oldest slot is replaced after every episode begun."""
+    """``world_pool`` corridors drawn from the training seeds; the oldest is replaced every ``world_renewal_episodes``."""
 
     def __init__(self, config: EnvironmentConfig, rng: np.random.Generator) -> None:
         self._config = config
-        self._oldest = 0
+        self._oldest = self._begun = 0
         self.seeds = rng.integers(TRAINING_SEED_START, EVALUATION_SEED_START, config.world_pool)
         self._worlds = [world_for_seed(int(seed), config) for seed in self.seeds]
 
     def next_world(self, environment: int, rng: np.random.Generator) -> World:
-        """A random corridor of the pool; one other slot gets a new corridor."""
-        slot = self._oldest
-        self._oldest = (slot + 1) % len(self._worlds)
-        self.seeds[slot] = rng.integers(TRAINING_SEED_START, EVALUATION_SEED_START)
-        self._worlds[slot] = world_for_seed(int(self.seeds[slot]), self._config)
+        """A random corridor of the pool."""
+        self._begun += 1
+        if self._begun % self._config.world_renewal_episodes == 0:
+            slot = self._oldest
+            self._oldest = (slot + 1) % len(self._worlds)
+            self.seeds[slot] = rng.integers(TRAINING_SEED_START, EVALUATION_SEED_START)
+            self._worlds[slot] = world_for_seed(int(self.seeds[slot]), self._config)
         return self._worlds[int(rng.integers(len(self._worlds)))]
 
     def state(self) -> dict[str, NDArray[np.int64] | int]:
-        """Seeds in the pool and the next slot to renew."""
-        return {"seeds": self.seeds.copy(), "oldest": self._oldest}
+        """Seeds in the pool, the next slot to renew, and the episodes begun."""
+        return {"seeds": self.seeds.copy(), "oldest": self._oldest, "begun": self._begun}
 
-    def restore(self, seeds: NDArray[np.int64], oldest: int) -> None:
+    def restore(self, state: dict[str, Any]) -> None:
         """Inverse of ``state``: draws the same corridors again."""
-        self.seeds = np.asarray(seeds, dtype=np.int64).copy()
-        self._oldest = int(oldest)
+        self.seeds = np.asarray(state["seeds"], dtype=np.int64).copy()
+        self._oldest, self._begun = int(state["oldest"]), int(state["begun"])
         self._worlds = [world_for_seed(int(seed), self._config) for seed in self.seeds]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
 import pytest
 
-from campaigns.publish import publish
+from campaigns.publish import lockstep_rows, publish, read_results
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -20,6 +21,22 @@ def test_readme_and_model_cards_are_what_the_results_say(tmp_path: Path, monkeyp
     publish()
     for path in [Path("README.md"), Path("docs/safety.md"), *Path("policies").glob("*.md")]:
         assert path.read_text() == (ROOT / path).read_text(), f"{path} is out of date: run python -m campaigns.publish"
+
+
+def evaluation(split: str, dynamics: str) -> dict[str, object]:
+    rate = {"rate": 0.9, "low": 0.8, "high": 0.95, "n": 50}
+    where = {"policy": "p.onnx", "weights_sha256": "w", "split": split, "dynamics": dynamics, "safety": True, "description": "d"}
+    return where | {"clean_success": rate, "path_efficiency": 0.95}
+
+
+def test_a_file_of_several_evaluations_gives_a_row_each_with_its_command(tmp_path: Path) -> None:
+    (tmp_path / "splits.json").write_text(json.dumps([evaluation("unseen", "internal"), evaluation("wind", "jsbsim")]))
+    (what, figure, command), (other, _, jsbsim) = lockstep_rows(read_results(tmp_path), "w")
+    assert "`unseen`, safety on, lockstep" in what
+    assert "90.0 %" in figure
+    assert command == "evaluate-policy p.onnx --split unseen --episodes 50 --safety on"
+    assert "`wind`, safety on, jsbsim dynamics" in other
+    assert jsbsim.endswith("--safety on --dynamics jsbsim")
 
 
 def test_every_shipped_policy_has_a_card_with_results() -> None:

@@ -37,6 +37,7 @@ def checkpoint_path(network: PolicyNetwork, tmp_path_factory: pytest.TempPathFac
         ({"feature_skip": False, "hidden_size": 24, "head_size": 16}, "gates"),
         ({"feature_skip": False, "hidden_size": 24, "head_size": 16}, "fused"),
         ({"memory": "none", "preprocessing": "channels"}, "gates"),
+        ({"memory": "gru"}, "gates"),
         ({"action_low": (-2.0, -1.0, -1.0, -2.0), "action_high": (3.0, 1.0, 1.0, 2.0)}, "gates"),
     ],
     ids=str,
@@ -55,6 +56,13 @@ def test_every_network_is_exported_within_the_tolerance(config: dict, form: str,
     assert 0.0 < metadata.verification.max_abs_difference <= TOLERANCE
     assert metadata.action.high == network.config.action_high
     assert verify_consistency(tmp_path / "policy.onnx", steps=200) < 1e-5
+
+
+def test_a_memory_that_no_file_can_carry_is_refused_by_name(tmp_path: Path) -> None:
+    network = make_network(memory="stack", stack_frames=4)
+    with pytest.raises(PolicyError, match=r"memory `stack` is for comparison in training"):
+        export.export_policy(make_checkpoint(network), tmp_path / "policy.onnx")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_file_is_a_standard_small_and_single_onnx_file(policy_path: Path) -> None:

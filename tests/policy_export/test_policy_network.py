@@ -11,7 +11,8 @@ from pydantic import ValidationError
 
 from policy_export.network import NetworkConfig, PolicyNetwork
 
-CASES = [{"memory": m, "preprocessing": p} for m in ("lstm", "none") for p in ("shaped", "channels")]
+CASES = [{"memory": m, "preprocessing": p} for m in ("lstm", "gru", "none") for p in ("shaped", "channels")]
+CASES += [{"memory": "stack"}]
 
 
 def by_steps(network: PolicyNetwork, obs: torch.Tensor, h: torch.Tensor, c: torch.Tensor, reset: torch.Tensor) -> tuple:
@@ -30,10 +31,11 @@ def loss(mean: torch.Tensor, value: torch.Tensor, state: tuple[torch.Tensor, tor
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(case.values()))
 def test_sequence_equals_steps(case: dict[str, str]) -> None:
-    network = make_network(**case).double()
+    network = make_network(spread=0.01, **case).double()
     obs = 4.0 * torch.rand(23, 5, 190, dtype=torch.float64)
     reset = torch.rand(23, 5) < 0.2
-    h, c = (state + 0.3 for state in network.initial_state(5))
+    h, c = network.initial_state(5)
+    h, c = h + 0.3, c + (0.3 if case["memory"] == "lstm" else 0.0)  # nothing else reads c
     wanted = [*network.parameters(), *((h.requires_grad_(), c.requires_grad_()) if network.config.state_size else ())]
     fast, slow = network.sequence(obs, h, c, reset), by_steps(network, obs, h, c, reset)
     torch.testing.assert_close(fast, slow, rtol=1e-12, atol=1e-12)
@@ -46,10 +48,11 @@ def test_sequence_equals_steps(case: dict[str, str]) -> None:
     assert used >= len(wanted) - 1  # all but log_std
 
 
+@pytest.mark.parametrize("memory", ["lstm", "gru", "stack"])
 @settings(max_examples=15, deadline=None)
 @given(cut=st.integers(1, 9), seed=st.integers(0, 1000))
-def test_nothing_crosses_a_reset(cut: int, seed: int) -> None:
-    network = make_network(seed).double()
+def test_nothing_crosses_a_reset(memory: str, cut: int, seed: int) -> None:
+    network = make_network(seed, memory=memory, hidden_size=16, stack_frames=6).double()
     generator = torch.Generator().manual_seed(seed)
     obs = 4.0 * torch.rand(10, 2, 190, dtype=torch.float64, generator=generator)
     reset = torch.zeros(10, 2, dtype=torch.bool)
@@ -69,6 +72,27 @@ def test_step_is_torchs_lstm() -> None:
     _, _, h1, c1 = network.step(obs, h, c)
     _, (h2, c2) = network.lstm(network.features(obs).unsqueeze(0), (h, c))
     torch.testing.assert_close((h1, c1), (h2, c2))
+
+
+def test_step_is_torchs_gru() -> None:
+    network = make_network(memory="gru").double()
+    obs = 4.0 * torch.rand(3, 190, dtype=torch.float64)
+    h = 0.2 * torch.randn(1, 3, 128, dtype=torch.float64)
+    _, _, h1, _ = network.step(obs, h, torch.zeros_like(h))
+    _, h2 = network.gru(network.features(obs).unsqueeze(0), h)
+    torch.testing.assert_close(h1, h2)
+
+
+def test_a_stack_sees_its_last_frames_and_no_more() -> None:
+    network = make_network(memory="stack", stack_frames=4).double()
+    obs = 4.0 * torch.rand(9, 1, 190, dtype=torch.float64)
+    reset, state = torch.zeros(9, 1, dtype=torch.bool), network.initial_state(1)
+    means, _, _ = network.sequence(obs, *state, reset)
+    for frame, last_changed in ((4, 7), (5, 8)):
+        other = obs.clone()
+        other[frame] += 0.5
+        changed = (network.sequence(other, *state, reset)[0] != means).any(-1)[:, 0].nonzero()[:, 0]
+        assert changed.tolist() == list(range(frame, last_changed + 1))
 
 
 @settings(max_examples=30, deadline=None)

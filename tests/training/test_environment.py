@@ -159,11 +159,15 @@ def test_reaching_the_goal_terminates_with_its_bonus():
 
 def test_contact_terminates_with_its_cost_and_the_next_episode_begins():
     env = calm_env(open_world(boxes=[[6.0, -0.5, 0.0, 7.0, 0.5, 10.0]]))
-    observation, _, terminated, _, info = fly(env, [1.0, 0.0, 0.0, 0.0], 200)
-    assert terminated[0]
+    paid = 0.0
+    while not (result := env.step(np.array([[1.0, 0.0, 0.0, 0.0]], np.float32)))[2][0]:
+        paid += result[1][0]
+    observation, reward, _, _, info = result
+    paid += reward[0]
     assert info["outcomes"] == ["contact"]
     assert info["min_clearance_m"][0] <= 0.0
     assert info["reward_terms"]["contact"] == pytest.approx(-2.0)
+    assert info["episode_return"][0] == pytest.approx(paid)
     assert info["final_obs"][0, 180] < 25.0  # the old episode's last goal offset
     assert observation[0, 180] == pytest.approx(26.0, abs=1e-3)  # the new one's first
     assert env.arena.ticks[0] == 0
@@ -235,11 +239,14 @@ def test_training_corridors_never_come_from_evaluation_seeds():
 
 def test_the_pool_is_renewed():
     rng = np.random.default_rng(0)
-    pool = WorldPool(EnvironmentConfig(world_pool=4), rng)
-    before = set(pool.seeds.tolist())
-    for _ in range(4):
+    pool = WorldPool(EnvironmentConfig(world_pool=4, world_renewal_episodes=3), rng)
+    before = pool.seeds.tolist()
+    for _ in range(11):
         pool.next_world(0, rng)
-    assert not before & set(pool.seeds.tolist())
+    assert pool.seeds.tolist()[3] == before[3]
+    assert not set(before[:3]) & set(pool.seeds.tolist())
+    pool.next_world(0, rng)
+    assert not set(before) & set(pool.seeds.tolist())
 
 
 def test_moving_share_gives_moving_corridors():

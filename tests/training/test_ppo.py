@@ -83,6 +83,28 @@ def test_correlated_densities_multiply_to_the_joint_gaussian():
     torch.testing.assert_close(total, joint)
 
 
+def squashed(mean, log_std, low, high):
+    """The policy as torch builds it: a normal, a tanh, and a scaling to the limits, Jacobians included."""
+    scale = torch.distributions.AffineTransform(0.5 * (low + high), 0.5 * (high - low))
+    parts = [torch.distributions.TanhTransform(), scale]
+    normal = torch.distributions.Normal(mean, log_std.exp())
+    return torch.distributions.Independent(torch.distributions.TransformedDistribution(normal, parts), 1)
+
+
+def test_ratios_of_raw_densities_are_those_of_the_squashed_actions():
+    net = network().double()
+    low, high = net.action_low, net.action_high
+    old, new = torch.randn(7, 4, dtype=torch.float64), torch.randn(7, 4, dtype=torch.float64)
+    old_std, new_std = torch.randn(4, dtype=torch.float64) * 0.3, torch.randn(4, dtype=torch.float64) * 0.3
+    raw = old + old_std.exp() * torch.randn(7, 4, dtype=torch.float64)
+    action = net.action(raw)
+    assert ((action > low) & (action < high)).all()
+    expected = squashed(new, new_std, low, high).log_prob(action) - squashed(old, old_std, low, high).log_prob(action)
+    zero = torch.zeros_like(raw)
+    got = correlated_log_prob(raw, new, new_std, zero, 0.0) - correlated_log_prob(raw, old, old_std, zero, 0.0)
+    torch.testing.assert_close(got, expected, rtol=1e-6, atol=1e-6)
+
+
 def test_entropy_is_torch_normal():
     log_std = torch.randn(4)
     torch.testing.assert_close(
@@ -100,12 +122,11 @@ def observations(steps, batch):
     return torch.rand(steps, batch, 190, generator=generator) * 4.0
 
 
-@pytest.mark.parametrize("memory", ["lstm", "none"])
+@pytest.mark.parametrize("memory", ["lstm", "gru", "stack", "none"])
 def test_sequences_equal_steps_with_the_state_cleared_at_episode_starts(memory):
     net, obs = network(memory), observations(12, 5)
     reset = torch.rand(12, 5, generator=torch.Generator().manual_seed(2)) < 0.25
-    width = net.config.state_size
-    h, c = torch.randn(1, 5, width), torch.randn(1, 5, width)
+    h, c = (torch.randn_like(state) for state in net.initial_state(5))
     means, values = evaluate_sequences(net, net.features(obs), h[0], c[0], reset)
     for t in range(12):
         keep = (~reset[t]).float().view(1, 5, 1)
@@ -129,22 +150,20 @@ def batch_for(net, config, gain):
     features = net.features(observations(config.steps, config.environments))
     shape = (config.steps, config.environments)
     reset = torch.zeros(shape, dtype=torch.bool)
-    zeros = torch.zeros(config.environments, net.config.state_size)
+    h, c = (state[0] for state in net.initial_state(config.environments))
     with torch.no_grad():
-        mean, value = evaluate_sequences(net, features, zeros, zeros, reset)
+        mean, value = evaluate_sequences(net, features, h, c, reset)
         noise = torch.randn(*shape, 4, generator=generator)
         raw = mean + net.log_std.exp() * noise
         log_prob = correlated_log_prob(raw, mean, net.log_std, torch.zeros_like(noise), 0.0)
     advantage = gain(raw)
-    return Batch(
-        features, raw, torch.zeros_like(noise), torch.zeros(shape), log_prob, advantage, value + advantage, reset, zeros, zeros
-    )
+    return Batch(features, raw, torch.zeros_like(noise), torch.zeros(shape), log_prob, advantage, value + advantage, reset, h, c)
 
 
 CONFIG = PpoConfig(environments=32, steps=8, minibatches=2, epochs=4, learning_rate=3e-3, target_kl=None)
 
 
-@pytest.mark.parametrize("memory", ["lstm", "none"])
+@pytest.mark.parametrize("memory", ["lstm", "gru", "stack", "none"])
 def test_updates_move_the_policy_towards_what_paid(memory):
     net = network(memory)
     batch = batch_for(net, CONFIG, lambda raw: raw[..., 0])

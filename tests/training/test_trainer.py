@@ -22,12 +22,15 @@ from training.checkpoint import CheckpointError, load_checkpoint, save_checkpoin
 from training.config import EvaluationConfig, PpoConfig, TrainingConfig
 from training.evaluation import evaluate, evaluation_environment
 from training.intervals import wilson_interval
-from training.ppo import correlated_log_prob, evaluate_sequences
+from training.ppo import TrainingDivergedError, advantages, correlated_log_prob, evaluate_sequences
 from training.trainer import Trainer, hold_ticks, layouts
 
 ROOT = Path(__file__).parents[2]
 PRESETS = sorted((ROOT / "configs" / "training").glob("*.yaml"))
 UPDATE = 8 * 16
+
+
+TINY_PPO = {"environments": 8, "steps": 16, "epochs": 2, "minibatches": 2}
 
 
 def tiny(**changes):
@@ -36,7 +39,7 @@ def tiny(**changes):
         "checkpoint_every_updates": 1,
         "environment": {"world_pool": 4, "time_limit_s": 3.0},
         "network": {"hidden_size": 16, "head_size": 8},
-        "ppo": {"environments": 8, "steps": 16, "epochs": 2, "minibatches": 2},
+        "ppo": TINY_PPO,
         "evaluation": {"every_decisions": 2 * UPDATE, "episodes": 3},
     }
     return TrainingConfig.model_validate(base | changes)
@@ -65,9 +68,10 @@ def test_presets_load_and_make_a_network(path):
     assert trainer.network.config.action_low == action.low
 
 
-@pytest.mark.parametrize("memory", ["lstm", "none"])
-def test_the_learner_sees_what_the_rollout_did(tmp_path, memory):
-    trainer = Trainer(tiny(memory=memory), tmp_path)
+@pytest.mark.parametrize("sequence", [None, 4])
+@pytest.mark.parametrize("memory", ["lstm", "gru", "stack", "none"])
+def test_the_learner_sees_what_the_rollout_did(tmp_path, memory, sequence):
+    trainer = Trainer(tiny(memory=memory, ppo={**TINY_PPO, "sequence": sequence}), tmp_path)
     resets = 0
     for hold in (4, 1):
         batch, summary = trainer.collector.collect(hold)
@@ -77,8 +81,45 @@ def test_the_learner_sees_what_the_rollout_did(tmp_path, memory):
         torch.testing.assert_close(log_prob, batch.log_prob, atol=1e-4, rtol=1e-4)
         torch.testing.assert_close(value, batch.target - batch.advantage, atol=1e-4, rtol=1e-4)
         assert summary.decisions == UPDATE
+        assert batch.reset.shape == (sequence or 16, UPDATE // (sequence or 16))
         resets += int(batch.reset[1:].sum())
     assert resets > 0  # three-second episodes end inside the rollouts
+
+
+def test_values_beyond_the_rollout_and_beyond_a_time_out_use_the_state_that_led_there(tmp_path, monkeypatch):
+    """Replays every environment's flight by itself, one step at a time, and values what it saw last."""
+    trainer = Trainer(tiny(environment={"world_pool": 4, "time_limit_s": 0.4}), tmp_path)
+    collector, network, seen = trainer.collector, trainer.network, []
+    step_held = trainer.env.step_held
+
+    def watched(actions, hold):
+        result = step_held(actions, hold)
+        seen.append((result[0].copy(), result[3].copy(), result[4].get("final_obs")))
+        return result
+
+    monkeypatch.setattr(trainer.env, "step_held", watched)
+    first = collector.observation.clone()
+    given = {}
+
+    def spy(rewards, values, last_value, terminated, truncated, final_values, decay):
+        given.update(last=last_value, truncated=truncated, final=final_values)
+        return advantages(rewards, values, last_value, terminated, truncated, final_values, decay)
+
+    monkeypatch.setattr("training.rollout.advantages", spy)
+    collector.collect(1)
+    assert given["truncated"].sum() > 0
+    with torch.no_grad():
+        for b in range(8):
+            h, c = network.initial_state(1)
+            observation = first[b : b + 1]
+            for t, (following, truncated, final) in enumerate(seen):
+                _, _, h, c = network.step(observation, h, c)
+                if truncated[b]:
+                    value = network.step(torch.from_numpy(final[b : b + 1]), h, c)[1]
+                    torch.testing.assert_close(given["final"][t, b], value[0], atol=1e-5, rtol=1e-5)
+                    h, c = network.initial_state(1)
+                observation = torch.from_numpy(following[b : b + 1])
+            torch.testing.assert_close(given["last"][b], network.step(observation, h, c)[1][0], atol=1e-5, rtol=1e-5)
 
 
 def test_same_seed_same_weights_another_seed_others(tmp_path):
@@ -87,6 +128,28 @@ def test_same_seed_same_weights_another_seed_others(tmp_path):
         run(trainer)
     assert same(weights(trainers[0]), weights(trainers[1]))
     assert not same(weights(trainers[0]), weights(trainers[2]))
+    assert curve(tmp_path / "0") == curve(tmp_path / "1") != curve(tmp_path / "2")
+
+
+def curve(folder):
+    """All that an update recorded, but for the time it took."""
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{name: value for name, value in row.items() if name not in ("seconds", "decisions_per_s")} for row in rows]
+
+
+def test_a_loss_that_is_not_a_number_stops_and_leaves_the_last_good_checkpoint(tmp_path):
+    trainer = Trainer(tiny(), tmp_path)
+    updates = trainer.updates()
+    for _ in range(2):
+        next(updates)
+    trainer.env.rules = trainer.env.rules._replace(scale=1e300)  # rewards beyond float32
+    with pytest.raises(TrainingDivergedError, match=r"loss nan.*lower ppo\.learning_rate"):
+        next(updates)
+    again = Trainer(tiny(), tmp_path)
+    again.resume(tmp_path / "last.pt")
+    assert again.update_count == 2
+    assert all(torch.isfinite(parameter).all() for parameter in again.network.parameters())
+    assert [status.decisions for status in again.updates()] == [3 * UPDATE, 4 * UPDATE]
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
@@ -151,6 +214,7 @@ def test_hold_falls_with_the_schedule():
     ("section", "message"),
     [
         ({"ppo": {"environments": 10, "minibatches": 4}}, "multiple of minibatches"),
+        ({"ppo": {"steps": 64, "sequence": 48}}, "multiple of sequence"),
         ({"ppo": {"hold": [{"share": 0.5, "ticks": 1}]}}, "start at share 0"),
         ({"evaluation": {"seed": 12}}, "greater than or equal to 1000000"),
         ({"decision": 3}, "Extra inputs"),
@@ -207,6 +271,24 @@ def test_command_trains_and_reports_json(tmp_path):
     assert "--resume" in again.stderr
 
 
+def test_command_takes_another_memory_and_refuses_an_unknown_one(tmp_path):
+    preset = write_preset(tmp_path / "small.yaml", decisions=UPDATE)
+    result = CliRunner().invoke(cli.app, ["--config", str(preset), "--out", str(tmp_path / "run"), "--memory", "gru"])
+    assert result.exit_code == 0, result.output
+    assert load_checkpoint(tmp_path / "run" / "last.pt")["network_config"]["memory"] == "gru"
+    result = CliRunner().invoke(cli.app, ["--config", str(preset), "--out", str(tmp_path / "other"), "--memory", "ltsm"])
+    assert result.exit_code == 2
+    assert "memory: Input should be 'lstm', 'gru', 'stack' or 'none'" in result.stderr
+
+
+def test_command_says_that_training_diverged(tmp_path):
+    preset = write_preset(tmp_path / "wild.yaml", environment={"world_pool": 4, "reward": {"progress_per_m": 1e300}})
+    result = CliRunner().invoke(cli.app, ["--config", str(preset), "--out", str(tmp_path / "run")])
+    assert result.exit_code == 1
+    assert "training diverged: loss nan" in result.stderr
+    assert not (tmp_path / "run" / "last.pt").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -244,13 +326,16 @@ def last_decisions(metrics):
 
 
 def test_killed_run_goes_on_and_a_terminated_one_saves(tmp_path):
-    preset = write_preset(tmp_path / "long.yaml", decisions=10_000_000, evaluation={"every_decisions": 10_000_000})
+    preset = write_preset(
+        tmp_path / "long.yaml", decisions=10_000_000, checkpoint_every_updates=1, evaluation={"every_decisions": 10_000_000}
+    )
     out = tmp_path / "run"
     process = start(["--config", str(preset), "--out", str(out)])
     wait_for(out / "last.pt")
     process.kill()
     process.communicate(timeout=30)
     before = load_checkpoint(out / "last.pt", resume=True)["training"]["steps"]
+    assert last_decisions(out / "metrics.jsonl") - before <= UPDATE
     process = start(["--resume", str(out)])
     metrics = out / "metrics.jsonl"
     end = time.monotonic() + 120.0

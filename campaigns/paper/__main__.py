@@ -1,0 +1,91 @@
+"""Train PPO and PPO-LSTM from several seeds and write the article's Table 2 and figures 4 to 9, theirs beside ours.
+
+    python -m campaigns.paper --out results/paper
+
+Whatever is finished is kept: stop it at any time and give the same command again. `--decisions` sets the volume of each run; the
+article's is 27,000 episodes of about 170 steps, 4.6 million decisions. `--ppo configs/training/ppo.yaml --lstm
+configs/training/ppo_lstm.yaml --runs runs/paper_tuned` compares the tuned presets instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from campaigns.errors import USER_ERRORS
+from campaigns.paper.figures import draw_bars, draw_curves, draw_flights
+from campaigns.paper.measures import flown_measures, read_curves, training_measures, write_json
+from campaigns.paper.report import article, make_table, markdown
+from campaigns.paper.runs import Run, study_runs, train_all
+from campaigns.splits import load_splits
+from flight.mission import load_mission
+from strict_yaml import load_config
+from training.checkpoint import CheckpointError
+from training.config import TrainingConfig
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line."""
+    chosen = _parser().parse_args(arguments)
+    presets = {"PPO": chosen.ppo, "PPO-LSTM": chosen.lstm}
+    algorithms = {name: load_config(path, TrainingConfig) for name, path in presets.items()}
+    decisions = None if chosen.decisions is None else int(chosen.decisions)
+    runs = study_runs(algorithms, chosen.seeds, decisions, chosen.runs)
+    train_all(runs, chosen.workers)
+    write_study(runs, chosen)
+    return 0
+
+
+def write_study(runs: list[Run], chosen: argparse.Namespace) -> None:
+    """Fly the trained policies, then write table, figures and reading."""
+    out: Path = chosen.out
+    out.mkdir(parents=True, exist_ok=True)
+    splits, safety = load_splits(["static", "unseen", "dynamic"], chosen.splits), load_mission(chosen.mission).safety
+    names = list(dict.fromkeys(run.algorithm for run in runs))
+    curves = {name: [read_curves(run) for run in runs if run.algorithm == name] for name in names}
+    measured = {
+        name: [
+            training_measures(read_curves(run)) | flown_measures(run, splits, safety, chosen.episodes, chosen.workers)
+            for run in runs
+            if run.algorithm == name
+        ]
+        for name in names
+    }
+    table = make_table(measured)
+    volume = f" --decisions {chosen.decisions:g}" if chosen.decisions else ""
+    command = (
+        f"python -m campaigns.paper --ppo {chosen.ppo} --lstm {chosen.lstm} --seeds {chosen.seeds}{volume} "
+        f"--episodes {chosen.episodes} --out {out}"
+    )
+    write_json(out / "table_2.json", table | {"command": command})
+    (out / "README.md").write_text(markdown(table, command), encoding="utf-8")
+    draw_curves(out, curves, article())
+    draw_flights(out, runs[: len(names)], splits["dynamic"], safety)
+    draw_bars(out, table)
+    sys.stdout.write(f"{out}/README.md\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m campaigns.paper", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, default=Path("results/paper"))
+    parser.add_argument("--runs", type=Path, default=Path("runs/paper"), help="folder of the training runs")
+    parser.add_argument("--ppo", type=Path, default=Path("configs/training/paper_ppo.yaml"), help="preset without memory")
+    parser.add_argument("--lstm", type=Path, default=Path("configs/training/paper_ppo_lstm.yaml"), help="preset with memory")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--decisions", type=float, help="replaces the presets' training volume")
+    parser.add_argument("--episodes", type=int, default=100, help="flights per policy and split")
+    parser.add_argument("--workers", type=int, help="processes; default: all cores")
+    parser.add_argument("--mission", type=Path, default=Path("configs/corridor.yaml"))
+    parser.add_argument("--splits", type=Path, default=Path("configs/evaluation.yaml"))
+    return parser
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except (*USER_ERRORS, CheckpointError) as mistake:
+        print(f"paper: {mistake}", file=sys.stderr)
+        sys.exit(2)
