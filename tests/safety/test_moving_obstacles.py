@@ -127,16 +127,18 @@ def test_the_vehicle_never_runs_into_crossing_movers(speed, seed):
     assert sim.truth.position_m[0] > 6.0
 
 
-@given(st.floats(0.01, 1.0), st.floats(0.5, 3.0))
-def test_a_standing_vehicle_counts_what_a_mover_covers_before_it_can_act(speed, away):
-    """A command takes dead time and a tick until it acts; nothing else is to come where nothing moves."""
+@given(st.floats(0.01, 1.0), st.floats(0.5, 3.0), st.floats(0.01, 0.2))
+def test_a_standing_vehicle_counts_what_a_mover_covers_before_it_can_act(speed, away, beam_m):
+    """A command takes dead time and a tick until it acts; and the return may be anywhere within the width of its beam."""
     c = config(obstacle_speed_m_s=speed)
     place = np.array([[[5.0, 0.0, 2.0]], [[5.0, 0.0, 2.0]]])
     view = View(FreeSpace(c), np.array([[5.0 + away], [0.0]]), 0.0)
-    around = Surroundings(*view.near_m, np.zeros(1), view, CorridorVector(5.0, 0.0, 2.0), Start(place[:, 0], np.zeros((2, 3))))
+    around = Surroundings(
+        *view.near_m, np.array([beam_m]), view, CorridorVector(5.0, 0.0, 2.0), Start(place[:, 0], np.zeros((2, 3)))
+    )
     clear = Shield(c)._tube_clearances(Tubes(place, place), around)
     blind_m = (c.velocity_error_m_s + speed) * (c.dead_time_s + c.tick_s)
-    assert clear == pytest.approx(away - c.keep_out_m - blind_m)
+    assert clear == pytest.approx(away - beam_m - c.keep_out_m - blind_m)
 
 
 @given(st.floats(0.11, 1.2), st.floats(0.2, 1.0))
