@@ -127,12 +127,12 @@ def _as_pushed(due_m_s: Floats, normals: Floats, push_m_s: Floats) -> Floats:
 
 
 def _outward(
-    tube: Tubes, clear_m: Floats, points_m: Floats, position_m: Floats, pressed: bool, config: SafetyConfig
+    tube: Tubes, clear_m: Floats, points_m: Floats, position_m: Floats, fenced: bool, config: SafetyConfig
 ) -> tuple[Floats, Floats]:
     """Directions [2, h] away from the points that braking comes near to, and the speed due along each [h].
 
     Positive: it comes too near; zero: onto the point; negative: there is room, but the way out of something else may not use up
-    more. `pressed`: that something may be the fence.
+    more. `fenced`: that something may be the fence.
     """
     if clear_m.shape[0] == 0:
         return _NO_NORMALS, _NO_SPEEDS
@@ -140,7 +140,7 @@ def _outward(
     here = points_m - position_m[:, None]
     depth_here = config.keep_out_m - slide - np.sqrt((here * here).sum(axis=0))
     depth = np.maximum(-clear_m - slide, depth_here)
-    if not pressed and not (depth > 0.0).any():  # the usual case
+    if not fenced and not (depth > 0.0).any():  # the usual case
         return _NO_NORMALS, _NO_SPEEDS
     near = depth > -NEAR_M
     near_now, depth, points = (depth_here >= depth)[near], depth[near], points_m[:, near]
@@ -151,9 +151,7 @@ def _outward(
     away = np.where(from_here, position_m[:, None], begin + share * leg) - points
     away /= np.maximum(np.sqrt((away * away).sum(axis=0)), _LEAST_M)
     due = np.where(depth <= config.margin_m + POINT_BAND_M, _hold_off_m_s(depth, config), 0.0)
-    # towards a point the error of the velocity counts over the whole lag, however slow: what room is left beyond that may be used
-    spare = np.minimum(depth + config.velocity_error_m_s * config.lag_s, 0.0)
-    return away, np.where(depth > 0.0, due, spare / stop_gain_s(config))
+    return away, np.where(depth > 0.0, due, depth / stop_gain_s(config))
 
 
 def _way_out_m_s(normals: Floats, due_m_s: Floats, config: SafetyConfig) -> Floats:

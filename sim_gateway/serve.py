@@ -48,7 +48,7 @@ def _usage_errors() -> Iterator[None]:
     except ScipServerError as error:
         raise UsageError(f"{error} with --lidar-port") from None
     except FileExistsError as error:
-        raise UsageError(f"{error.filename2} exists and is not a link: choose another name") from None
+        raise UsageError(f"{error.filename2} exists and is not a link: name another (--serial-link, --link pty:)") from None
 
 
 def serve_fleet(world: World, config: GatewayConfig, vehicles: int, quit_with_parent: bool) -> None:

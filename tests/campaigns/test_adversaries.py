@@ -177,6 +177,17 @@ def test_it_gets_out_in_time(name, seed):
     assert clear
 
 
+def test_drift_over_the_fence_beside_an_obstacle_is_led_back():
+    """The way back was refused for a millimetre of the obstacle's margin, and drift went on outwards."""
+    outcome = run_case(Case.parse("main/concave/graze/3")).outcome
+    assert not outcome.events
+    assert outcome.fence_m > 0.03
+
+
+def test_the_way_out_of_a_margin_grows_no_faster_than_the_limits():
+    assert not run_case(Case.parse("main/poles/diagonal/0")).outcome.events
+
+
 def test_a_filter_that_only_brakes_does_not_get_out():
     class Frozen(SafetyFilter):
         def apply(self, command, state, scan, now_s):

@@ -73,7 +73,7 @@ def test_directions_and_speeds_due_are_those_of_the_slow_way(seed):
         place = position if near_now or depth > MARGIN else to_leg(p, tube.turn_m[0, -1, :2], tube.stop_m[0, -1, :2])[0]
         away = (place - p) / max(math.dist(place, p), 1e-6)
         due = hold_off(depth) if depth <= MARGIN + POINT_BAND else 0.0
-        wanted.append((*away, due if depth > 0.0 else min(depth + 0.05 * 0.6, 0.0) / GAIN))
+        wanted.append((*away, due if depth > 0.0 else depth / GAIN))
     assert speeds.shape == (len(wanted),)
     for at, (x, y, speed) in enumerate(wanted):
         assert (normals[0, at], normals[1, at], speeds[at]) == pytest.approx((x, y, speed), abs=1e-9)

@@ -9,7 +9,6 @@ import pytest
 from safety_plant import ZERO, config, scan, state
 
 from safety.braking import Start
-from safety.config import Fence
 from safety.frames import CorridorVector
 from safety.free_space import FreeSpace
 from safety.lidar import BeamTable, see
@@ -21,16 +20,14 @@ X, Y = 15.05, 0.05
 KEPT_M = C.keep_out_m + C.velocity_error_m_s * (C.dead_time_s + C.tick_s)  # at rest, of a point seen just now
 
 
-def sent_at_rest(
-    *points: tuple[float, float], within=lambda few: np.ones(len(few), dtype=bool), place=(X, Y), chosen=C
-) -> CorridorVector:
+def sent_at_rest(*points: tuple[float, float], within=lambda few: np.ones(len(few), dtype=bool)) -> CorridorVector:
     """What is sent for a command of zero by a vehicle at rest, all seen around it; points by distance and bearing."""
-    free, (x, y) = FreeSpace(chosen), place
-    free.update(see(scan(beams=360, fov=2.0 * math.pi), state(x=x, y=y), BeamTable(), chosen))
+    free, x, y = FreeSpace(C), X, Y
+    free.update(see(scan(beams=360, fov=2.0 * math.pi), state(x=x, y=y), BeamTable(), C))
     at = np.array([(x + d * math.cos(bearing), y + d * math.sin(bearing)) for d, bearing in points]).T
     start = Start(np.array([(x, y, 2.0)] * 2), np.zeros((2, 3)))
     around = Surroundings(at[0], at[1], np.zeros(len(points)), View(free, at, 0.0), CorridorVector(x, y, 2.0), start)
-    return Shield(chosen).choose(ZERO, around, within).velocity
+    return Shield(C).choose(ZERO, around, within).velocity
 
 
 @pytest.mark.parametrize("bearing", [-1.7, -1.9, 1.7, 2.1])
@@ -59,16 +56,3 @@ def test_the_way_out_keeps_to_the_limits():
         assert full.x * (1.0 if longest else 0.0) <= sent.x <= 0.0
         assert -longest <= sent.x
         assert longest == 0.0 or sent.x < -0.25 * longest
-
-
-def test_pressed_by_the_fence_it_slides_along_a_wall():
-    """Drift leads over a slanted edge; straight back is a wall with next to no room left: it goes back along that wall."""
-    fence = Fence(floor_m=0.3, ceiling_m=4.0, inclusion=((X - 6.0, Y - 5.0), (X + 9.0, Y - 5.0), (X + 9.0, Y + 5.0)))
-    chosen = config(fence=fence)
-    edge = np.array((-10.0, 15.0)) / math.hypot(15.0, 10.0)  # outward
-    out = chosen.eroded_fence().room_m((X, Y))
-    place = np.array((X, Y)) + (out + 0.05) * edge
-    below = [(math.hypot(d, KEPT_M + 0.002), math.atan2(-KEPT_M - 0.002, d)) for d in np.linspace(-0.5, 0.5, 21)]
-    sent = sent_at_rest(*below, place=place, chosen=chosen)
-    assert -(edge @ (sent.x, sent.y)) > 0.05
-    assert sent.y > -1e-6
