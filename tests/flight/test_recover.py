@@ -91,7 +91,7 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path, whole: bytes) -> None
     assert data is not None
     before, after = set(messages(whole)), set(messages(data))
     assert after < before
-    assert len(before - after) < 0.2 * len(before)
+    assert len(before - after) < 0.4 * len(before)  # a chunk is as long as it took to fill or to write: a third of a short flight
 
 
 def test_no_damage_ends_in_anything_but_one_line(tmp_path: Path, whole: bytes) -> None:
