@@ -228,13 +228,14 @@ class UdpLink(MavlinkLink):
         self._forget_silent_peers()
         for _ in range(_DATAGRAMS_PER_POLL):
             try:
-                data, peer = self.socket.recvfrom(_MAX_DATAGRAM)
+                data, peer = self.socket.recvfrom(_MAX_DATAGRAM + 1)
             except BlockingIOError:
                 break
             except OSError as error:
                 _log.debug("receiving on the %s link: %s", self.name, error)
                 continue
-            found = _parse(data) if self._is_heard(peer[0]) else []
+            whole = len(data) <= _MAX_DATAGRAM  # of a longer one the rest is lost: none of it is taken
+            found = _parse(data) if whole and self._is_heard(peer[0]) else []
             if found:
                 self._remember(peer)
             messages.extend(found)

@@ -122,7 +122,8 @@ def _wrong_checksum(frame: bytes) -> bytes:
 def _oversized() -> list[bytes]:
     """Frames that claim the largest payload, complete and not, and datagrams larger than the gateway reads."""
     claim = bytes((253, 255, 0, 0, 0, 200, 1, 76, 0, 0))
-    return [claim, claim + bytes(300), claim + os.urandom(4000), os.urandom(9000), _arm() + os.urandom(20_000), bytes(60_000)]
+    large = [os.urandom(9000), _arm() + os.urandom(20_000), _arm() * 400, bytes(60_000)]
+    return [claim, claim + bytes(300), claim + os.urandom(4000), *large]
 
 
 def test_random_truncated_oversized_and_damaged_frames(running: Running) -> None:
