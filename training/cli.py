@@ -25,6 +25,8 @@ train-policy --config configs/training/ppo_lstm.yaml --out runs/night --seed 3 -
 
 train-policy --resume runs/night
 
+train-policy --config configs/training/ppo_lstm_dynamic.yaml --start-from runs/night/best.pt
+
 torchrun --nproc-per-node 2 -m training.cli --config configs/training/ppo_lstm.yaml
 """
 
@@ -40,6 +42,7 @@ def train(
     config: Annotated[Path | None, typer.Option(help="Training preset (YAML), see configs/training/.")] = None,
     out: Annotated[Path | None, typer.Option(help="Run folder; default runs/NAME-OF-PRESET.")] = None,
     resume: Annotated[Path | None, typer.Option(help="Go on with the run in this folder, from its last.pt.")] = None,
+    start_from: Annotated[Path | None, typer.Option(help="Checkpoint whose weights a new run begins with.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Replaces the preset's seed.")] = None,
     decisions: Annotated[float | None, typer.Option(min=1, help="Replaces the preset's number of decisions.")] = None,
     memory: Annotated[str | None, typer.Option(help="Replaces the preset's memory: lstm, gru, stack or none.")] = None,
@@ -58,7 +61,7 @@ def train(
 
     try:
         changes = {"seed": seed, "decisions": decisions and int(decisions), "memory": memory}
-        result = _run(config, out, resume, changes, device, threads)
+        result = _run(config, out, resume, start_from, changes, device, threads)
     except (_UsageError, ConfigError, CheckpointError) as error:
         _fail(str(error), 2)
     except KeyboardInterrupt:
@@ -75,10 +78,18 @@ def _fail(message: str, code: int) -> None:
 
 
 def _run(
-    config: Path | None, out: Path | None, resume: Path | None, changes: dict[str, Any], device: str, threads: int
+    config: Path | None,
+    out: Path | None,
+    resume: Path | None,
+    start_from: Path | None,
+    changes: dict[str, Any],
+    device: str,
+    threads: int,
 ) -> dict[str, Any]:
     if (config is None) == (resume is None):
         raise _UsageError("give either --config PRESET.yaml (a new run) or --resume RUN_FOLDER")
+    if resume is not None and start_from is not None:
+        raise _UsageError("--start-from belongs to a new run; a resumed one goes on with its own weights")
     import torch
 
     torch.set_num_threads(threads)
@@ -93,6 +104,8 @@ def _run(
         trainer = Trainer(settings, folder, device, team)
         if resume is not None:
             trainer.resume(resume / "last.pt")
+        elif start_from is not None:
+            trainer.start_from(start_from)
         interrupted = _train(trainer)
     finally:
         leave(team)

@@ -68,6 +68,7 @@ class Trainer:
         self.collector = RolloutCollector(self.env, self.network, config.ppo, self.generator)
         self.decisions = self.update_count = 0
         self.seconds = 0.0
+        self.ancestry: list[dict[str, Any]] = []  # the runs whose weights this one began with, the first one first
         self.commit = git_commit()  # of the code that is running, whatever is checked out later
         self.best = -1.0
         self.evaluation: dict[str, Any] | None = None
@@ -158,6 +159,7 @@ class Trainer:
     def _content(self) -> dict[str, Any]:
         config, learner, network = self.config, self.learner, self.network
         training = {"config_hash": config.digest(), "seed": config.seed, "steps": self.decisions, "git_commit": self.commit}
+        training |= {"started_from": self.ancestry} if self.ancestry else {}
         training |= {"updates": self.update_count, "seconds": round(self.seconds, 1), "evaluation": self.evaluation or {}}
         resume = {"config": config.model_dump(mode="json"), "best": self.best, "next_evaluation": self.next_evaluation}
         resume |= {"seconds": self.seconds, "learning_rate": learner.learning_rate, "processes": self.team.size}
@@ -166,6 +168,18 @@ class Trainer:
         content = {"network_config": network.config.to_dict(), "state_dict": _on_cpu(network.state_dict()), "training": training}
         content |= {"layout": layout, "optimizer": learner.optimizer.state_dict(), "resume": resume}
         return dict(to_plain(content))
+
+    def start_from(self, path: Path) -> None:
+        """Begin a new run with the weights of another one; its optimiser, decisions and evaluations are not taken over.
+
+        Raises CheckpointError when its network has another form.
+        """
+        content = load_checkpoint(path)
+        if content["network_config"] != self.network.config.to_dict():
+            raise CheckpointError(f"{path}: its network differs from this run's; give the preset it was trained with")
+        self.network.load_state_dict(content["state_dict"])
+        before = content["training"]
+        self.ancestry = [*before.get("started_from", []), {key: before[key] for key in ("config_hash", "seed", "steps")}]
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of a run with the same configuration and as many processes."""
@@ -178,6 +192,7 @@ class Trainer:
         self.learner.learning_rate = saved["learning_rate"]
         self.decisions, self.update_count = content["training"]["steps"], content["training"]["updates"]
         self.evaluation = content["training"]["evaluation"] or None
+        self.ancestry = content["training"].get("started_from", [])
         self.best, self.next_evaluation, self.seconds = saved["best"], saved["next_evaluation"], saved["seconds"]
         self._recent.extend(saved["recent"])
         own = saved if self.team.leads else load_plain(path.parent / self._part().name)

@@ -169,6 +169,24 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
     assert [row["decisions"] for row in rows] == [UPDATE * k for k in (1, 2, 3, 4)]
 
 
+def test_a_run_can_begin_with_the_weights_of_another_and_says_so(tmp_path):
+    first = Trainer(tiny(), tmp_path / "first")
+    run(first)
+    second = Trainer(tiny(seed=9), tmp_path / "second")
+    second.start_from(tmp_path / "first" / "last.pt")
+    assert same(weights(first), weights(second))
+    assert (second.decisions, second.evaluation) == (0, None)
+    run(second)
+    origin = {"config_hash": tiny().digest(), "seed": tiny().seed, "steps": 4 * UPDATE}
+    saved = load_checkpoint(tmp_path / "second" / "last.pt", resume=True)
+    assert saved["training"]["started_from"] == [origin]
+    again = Trainer(tiny(seed=9), tmp_path / "second")
+    again.resume(tmp_path / "second" / "last.pt")
+    assert again.ancestry == [origin]
+    with pytest.raises(CheckpointError, match="its network differs"):
+        Trainer(tiny(memory="gru"), tmp_path / "third").start_from(tmp_path / "first" / "last.pt")
+
+
 def test_rows_of_repeated_updates_and_torn_lines_are_dropped_on_resume(tmp_path):
     trainer = Trainer(tiny(decisions=UPDATE), tmp_path)
     run(trainer)
@@ -295,6 +313,7 @@ def test_command_says_that_training_diverged(tmp_path):
         ([], "either --config"),
         (["--config", "absent.yaml"], "absent.yaml: cannot be read"),
         (["--resume", "nowhere"], "no such checkpoint"),
+        (["--resume", "run", "--start-from", "other.pt"], "--start-from belongs to a new run"),
     ],
 )
 def test_command_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch):
