@@ -175,7 +175,7 @@ class Trainer:
         Raises CheckpointError when its network has another form.
         """
         content = load_checkpoint(path)
-        if content["network_config"] != self.network.config.to_dict():
+        if NetworkConfig.from_dict(content["network_config"]) != self.network.config:
             raise CheckpointError(f"{path}: its network differs from this run's; give the preset it was trained with")
         self.network.load_state_dict(content["state_dict"])
         before = content["training"]
