@@ -15,19 +15,19 @@ def markdown(reports: list[dict[str, Any]]) -> str:
 
 def overview(reports: list[dict[str, Any]]) -> str:
     """One row per evaluation."""
-    head = "policy | split | dynamics | safety | clean success | success | collisions | path efficiency | mean jerk, m/s3"
+    head = "policy | split | dynamics | safety | clean success | clean arrival | success | collisions | path efficiency | mean jerk, m/s3"
     rows = [
         " | ".join(
             (
                 *(str(one[key]) for key in ("policy", "split", "dynamics")),
                 "on" if one["safety"] else "off",
-                *(_rate(one[key]) for key in ("clean_success", "success")),
+                *(_rate(one[key]) for key in ("clean_success", "clean_arrival", "success")),
                 *(f"{one[key]:.3f}" for key in ("collisions_per_episode", "path_efficiency", "mean_jerk_m_s3")),
             )
         )
         for one in reports
     ]
-    return "\n".join([f"| {head} |", "|---" * 9 + "|", *(f"| {row} |" for row in rows), ""])
+    return "\n".join([f"| {head} |", "|---" * 10 + "|", *(f"| {row} |" for row in rows), ""])
 
 
 def one_evaluation(one: dict[str, Any]) -> str:
@@ -38,6 +38,7 @@ def one_evaluation(one: dict[str, Any]) -> str:
         ("dynamics", one["dynamics"]),
         ("safety layer", "on" if one["safety"] else "off"),
         ("clean success (goal within 0.3 m, no contact), 95 % interval", _rate(one["clean_success"])),
+        ("clean arrival (goal by its own estimate, no contact, inside the fence)", _rate(one["clean_arrival"])),
         ("success (contacts allowed)", _rate(one["success"])),
         ("collisions per episode", f"{one['collisions_per_episode']:.3f}"),
         ("path efficiency", f"{one['path_efficiency']:.3f}"),

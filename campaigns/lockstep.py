@@ -189,6 +189,7 @@ class LockstepFlight:
         return EpisodeResult(
             seed=self.world.seed,
             success=success,
+            arrived=math.isfinite(reached_s),
             contacts=simulation.contacts,
             failure=failure,
             ticks=ticks,

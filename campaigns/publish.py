@@ -66,6 +66,8 @@ def lockstep_rows(results: dict[str, dict[str, Any]], weights: str | None = None
         how, option = ("lockstep", "") if dynamics == "internal" else (f"{dynamics} dynamics", f" --dynamics {dynamics}")
         what = f"clean success, `{split}`, safety {safety}, {how}: {result['description']}"
         figure = f"{rate(result['clean_success'])}; path efficiency {result['path_efficiency']:.3f}"
+        if result["clean_arrival"]["rate"] != result["clean_success"]["rate"]:
+            figure += f"; arrived cleanly by its own estimate: {rate(result['clean_arrival'])}"
         command = f"evaluate-policy {result['policy']} --split {split} --episodes {n} --safety {safety}{option}"
         rows.append((what, figure, command))
     return rows

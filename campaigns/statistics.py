@@ -11,10 +11,14 @@ from training.intervals import wilson_interval
 
 @dataclass(frozen=True, slots=True)
 class EpisodeResult:
-    """What one flight came to. Lengths in m, times in s; `failure` is None or one of the causes in `FAILURES`."""
+    """What one flight came to. Lengths in m, times in s; `failure` is None or one of the causes in `FAILURES`.
+
+    `success`: the true position came within the goal's radius. `arrived`: the vehicle took itself to be there.
+    """
 
     seed: int
     success: bool
+    arrived: bool
     contacts: int
     failure: str | None
     ticks: int
@@ -29,6 +33,11 @@ class EpisodeResult:
     def clean_success(self) -> bool:
         """The goal within its radius and nothing touched."""
         return self.success and self.contacts == 0
+
+    @property
+    def clean_arrival(self) -> bool:
+        """At the goal as far as the vehicle could know, nothing touched, the fence not left."""
+        return self.arrived and self.contacts == 0 and self.failure in (None, "missed_goal")
 
     @property
     def path_efficiency(self) -> float:
@@ -62,6 +71,7 @@ def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
     return {
         "success": proportion([r.success for r in results]),
         "clean_success": proportion([r.clean_success for r in results]),
+        "clean_arrival": proportion([r.clean_arrival for r in results]),
         "collisions_per_episode": mean([r.contacts for r in results]),
         "path_efficiency": mean([r.path_efficiency for r in done]),
         "episode_steps": mean([r.ticks for r in done]),

@@ -54,7 +54,7 @@ class TrainingFlight:
         self.pilot = Pilot(runner, safety, CorridorVector(*world.goal), config.arrival_radius_m)
         self.log = FlightLog(max_ticks=self.env.rules.tick_limit + 1)
         self._velocities: list[NDArray[np.float64]] = []
-        self._left_fence = False
+        self._left_fence = self._arrived = False
 
     def run(self) -> EpisodeResult:
         """Fly until the goal, a contact or the time limit."""
@@ -64,6 +64,7 @@ class TrainingFlight:
             now_s = float(arena.ticks[0]) * TICK_S
             record = self.pilot.tick(self._scan(now_s), self._state(now_s), now_s)
             self.log.append(record, now_s)
+            self._arrived = self._arrived or record.goal_reached
             self._fly(record.sent)
         return self._result()
 
@@ -99,6 +100,7 @@ class TrainingFlight:
         return EpisodeResult(
             seed=world.seed,
             success=outcome == kernels.GOAL,
+            arrived=self._arrived or outcome == kernels.GOAL,
             contacts=int(outcome == kernels.CONTACT),
             failure=self._failure(outcome, radius),
             ticks=ticks,
@@ -118,7 +120,9 @@ class TrainingFlight:
             return what_was_hit(arena.boxes[0, :count], fixed, (x, y, z), radius_m)
         if self._left_fence or outcome == kernels.LEFT_BAND:
             return "fence"
-        return None if outcome == kernels.GOAL else "timeout"
+        if outcome == kernels.GOAL:
+            return None
+        return "missed_goal" if self._arrived else "timeout"
 
 
 def _environment(world: World, config: StackConfig) -> EnvironmentConfig:

@@ -9,7 +9,7 @@ from campaigns.statistics import EpisodeResult
 
 
 def episode(seed: int, success: bool = True, contacts: int = 0, speed: float = 0.8) -> EpisodeResult:
-    return EpisodeResult(seed, success, contacts, None, 800, 40.0, 40.0 * speed, 30.0, 0.1, 1.0, {})
+    return EpisodeResult(seed, success, success, contacts, None, 800, 40.0, 40.0 * speed, 30.0, 0.1, 1.0, {})
 
 
 def sides(on: list[EpisodeResult], off: list[EpisodeResult]) -> dict:

@@ -26,7 +26,7 @@ def test_readme_and_model_cards_are_what_the_results_say(tmp_path: Path, monkeyp
 def evaluation(split: str, dynamics: str) -> dict[str, object]:
     rate = {"rate": 0.9, "low": 0.8, "high": 0.95, "n": 50}
     where = {"policy": "p.onnx", "weights_sha256": "w", "split": split, "dynamics": dynamics, "safety": True, "description": "d"}
-    return where | {"clean_success": rate, "path_efficiency": 0.95}
+    return where | {"clean_success": rate, "clean_arrival": rate, "path_efficiency": 0.95}
 
 
 def test_a_file_of_several_evaluations_gives_a_row_each_with_its_command(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from training.intervals import wilson_interval
 
 
 def episode(seed: int = 0, *, success: bool = True, contacts: int = 0, failure: str | None = None) -> EpisodeResult:
-    return EpisodeResult(seed, success, contacts, failure, 600, 30.0, 30.0, 27.0, 0.4, 1.0, {"shield": 3})
+    return EpisodeResult(seed, success, success, contacts, failure, 600, 30.0, 30.0, 27.0, 0.4, 1.0, {"shield": 3})
 
 
 def test_wilson_agrees_with_published_values() -> None:
@@ -51,6 +51,23 @@ def test_a_goal_reached_with_contact_is_success_but_not_clean() -> None:
     assert summary["failures"] == {"hit_static": [2], "timeout": [3]}
     assert summary["path_efficiency"] == pytest.approx(0.9)
     assert summary["interventions_per_tick"]["shield"] == pytest.approx(9 / 1800)
+
+
+@pytest.mark.parametrize(
+    ("arrived", "contacts", "failure", "clean"),
+    [
+        (True, 0, None, True),
+        (True, 0, "missed_goal", True),
+        (True, 0, "fence", False),
+        (True, 1, "wall", False),
+        (False, 0, "timeout", False),
+    ],
+)
+def test_a_clean_arrival_is_judged_by_what_the_vehicle_could_know(arrived, contacts, failure, clean) -> None:
+    flown = EpisodeResult(1, False, arrived, contacts, failure, 600, 30.0, 30.0, 27.0, 0.4, 1.0, {})
+    assert flown.clean_arrival is clean
+    assert summarise([flown])["clean_arrival"]["rate"] == float(clean)
+    assert not flown.clean_success
 
 
 def test_proportion_counts() -> None:
