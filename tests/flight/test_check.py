@@ -356,6 +356,7 @@ def test_the_policy_file_and_its_hash(air: Air, tmp_path: Path, seeker_policy: P
     assert line(lines(text.replace(str(seeker_policy), "nowhere.onnx")), "policy file").level is Level.FAIL
 
 
+@pytest.mark.realtime  # the check measures how late this computer wakes up
 def test_apply_sets_what_is_wrong_and_uploads_a_fence_that_is_read_back(
     tmp_path: Path, seeker_policy: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
