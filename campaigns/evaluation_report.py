@@ -15,7 +15,8 @@ def markdown(reports: list[dict[str, Any]]) -> str:
 
 def overview(reports: list[dict[str, Any]]) -> str:
     """One row per evaluation."""
-    head = "policy | split | dynamics | safety | clean success | clean arrival | success | collisions | path efficiency | mean jerk, m/s3"
+    rates = "clean success | clean arrival | success"
+    head = f"policy | split | dynamics | safety | {rates} | collisions | path efficiency | mean jerk, m/s3"
     rows = [
         " | ".join(
             (

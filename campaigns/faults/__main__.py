@@ -25,15 +25,21 @@ def _arguments() -> argparse.Namespace:
 
 
 def _lockstep(arguments: argparse.Namespace) -> dict[str, Any]:
-    from campaigns.faults.campaign import cases, run_all, summarise
+    from campaigns.faults.campaign import Result, cases, run_all, summarise
     from campaigns.faults.scenes import FLIGHT_SCENES, SCENES
 
     only = arguments.only.split(",") if arguments.only else None
     scenes = tuple(arguments.scenes.split(",")) if arguments.scenes else FLIGHT_SCENES
     if set(scenes) - set(SCENES):
         raise ValueError(f"scenes are: {', '.join(SCENES)}")
-    results = run_all(cases(arguments.seeds, only, scenes), arguments.mission, arguments.jobs)
-    return summarise(results, "python -m campaigns.faults " + " ".join(sys.argv[1:]), arguments.seeds)
+
+    def summary(results: list[Result]) -> dict[str, Any]:
+        return summarise(results, "python -m campaigns.faults " + " ".join(sys.argv[1:]), arguments.seeds)
+
+    def keep(results: list[Result]) -> None:
+        _keep(summary(results) | {"partial": True}, arguments.out)
+
+    return summary(run_all(cases(arguments.seeds, only, scenes), arguments.mission, arguments.jobs, keep))
 
 
 def _realtime(arguments: argparse.Namespace) -> dict[str, Any]:

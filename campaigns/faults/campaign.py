@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -28,6 +29,7 @@ from safety.filter import SafetyFilter
 ENTRIES: dict[str, Entry] = {entry.id: entry for entry in IN_FLIGHT}
 GROUND_ENTRIES = {entry.id: entry for entry in GROUND}
 ON_GROUND = "ground"
+KEEP_EVERY_S = 20.0
 _loaded: dict[Path, tuple[Mission, PolicyRunner]] = {}
 
 
@@ -82,10 +84,13 @@ def result_of(case: Case, expected: str, bound_s: float | None, verdict: Verdict
     return Result(case.entry, case.scene, case.seed, expected, bound_s=bound_s, **values)
 
 
-def run_all(wanted: list[Case], mission_file: Path, jobs: int | None = None) -> list[Result]:
-    """All cases on `jobs` processes, with a progress bar; in the order of `wanted`."""
+def run_all(
+    wanted: list[Case], mission_file: Path, jobs: int | None = None, keep: Callable[[list[Result]], None] = lambda _: None
+) -> list[Result]:
+    """All cases on `jobs` processes, with a progress bar; in the order of `wanted`. `keep` gets what there is now and then."""
     jobs = min(jobs or os.cpu_count() or 1, len(wanted))
     results: dict[Case, Result] = {}
+    kept_s = time.monotonic()
     with _progress() as progress:
         bar = progress.add_task("faults", total=len(wanted), bad=0)
         for case, result in _played(wanted, mission_file, jobs):
@@ -94,6 +99,9 @@ def run_all(wanted: list[Case], mission_file: Path, jobs: int | None = None) -> 
             progress.update(bar, advance=1, bad=bad)
             if result.problem is not None:
                 progress.console.print(f"{result.fault} {result.scene} seed {result.seed}: {result.problem}", highlight=False)
+            if time.monotonic() - kept_s > KEEP_EVERY_S:
+                kept_s = time.monotonic()
+                keep([results[case] for case in wanted if case in results])
     return [results[case] for case in wanted]
 
 

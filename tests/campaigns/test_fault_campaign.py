@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from campaigns.faults.campaign import ENTRIES, GROUND_ENTRIES, cases, run_case, summarise
+from campaigns.faults import campaign
+from campaigns.faults.campaign import ENTRIES, GROUND_ENTRIES, ON_GROUND, Result, cases, run_all, run_case, summarise
 from campaigns.faults.catalogue import ELSEWHERE, IN_FLIGHT, Expected, Reaction
 from campaigns.faults.ground import VARIANTS
 from campaigns.faults.oracle import judge
@@ -93,6 +94,14 @@ def test_the_same_case_gives_the_same_result() -> None:
 
 
 # -- the campaign can fail
+
+
+def test_what_is_done_is_kept_on_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(campaign, "KEEP_EVERY_S", 0.0)
+    wanted = [Case(next(iter(GROUND_ENTRIES)), ON_GROUND, variant) for variant in range(2)]
+    kept: list[list[Result]] = []
+    results = run_all(wanted, MISSION, 1, kept.append)
+    assert kept == [results[:1], results]
 
 
 @pytest.mark.parametrize(("fault", "scene"), [("L4", "wall"), ("E9", "hover"), ("P5", "corner"), ("L5", "yawing")])
