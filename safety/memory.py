@@ -7,6 +7,8 @@ field of view, or is hidden behind something nearer, stays.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +20,8 @@ CAPACITY = 2048
 MOVED_S = (
     1.0  # so long a point spreads at the obstacles' speed; after that the unseen that grows into the map of free space holds
 )
+ALONG_BOTH_AXES = math.sqrt(2.0)  # bounds of errors are per axis
+LEAST_DEPTH_M = 0.1  # nothing is taken to be thinner: a pole seen from one side can be drifted upon from the other
 SAME_PLACE_M = 0.2  # a return this close to a remembered one, along its beam, is the same thing seen again
 
 
@@ -42,10 +46,7 @@ class ObstacleMemory:
         old = self._points[:, : self._count]
         if self._count:
             old = old[:, self._kept(seen, reach_m, config)]
-        near = (seen.x_m - seen.origin_x_m) ** 2 + (seen.y_m - seen.origin_y_m) ** 2 < reach_m * reach_m
-        new = np.empty((4, int(np.count_nonzero(near))))
-        new[0], new[1], new[2], new[3] = seen.x_m[near], seen.y_m[near], seen.spread_m[near], seen.time_s
-        new = new[:, :CAPACITY]
+        new = _new_points(seen, reach_m)[:, :CAPACITY]
         old = old[:, max(0, old.shape[1] + new.shape[1] - CAPACITY) :]
         split, end = old.shape[1], old.shape[1] + new.shape[1]
         self._points[:, :split] = old.copy()
@@ -81,5 +82,26 @@ class ObstacleMemory:
         """Coordinates x, y [k] and the extra radius [k] each point has by beam width, age, drift and own motion, m."""
         x, y, spread, time_s = self._points[:, : self._count]
         age = np.maximum(now_s - time_s, 0.0)
-        drift = np.minimum(age * config.velocity_error_m_s, config.position_error_m)
+        drift = ALONG_BOTH_AXES * np.minimum(age * config.velocity_error_m_s, 2.0 * config.position_error_m)
         return x, y, spread + drift + np.minimum(age, MOVED_S) * config.obstacle_speed_m_s
+
+
+def _new_points(seen: SeenScan, reach_m: float) -> Floats:
+    """Rows x, y, spread, time of the returns within reach, and of a place behind each that is an edge: its far side is there too."""
+    dx, dy = seen.x_m - seen.origin_x_m, seen.y_m - seen.origin_y_m
+    distance = np.sqrt(dx * dx + dy * dy)
+    near = distance < reach_m
+    rows = np.array((seen.x_m, seen.y_m, seen.spread_m, np.full(distance.shape, seen.time_s)))
+    edge = near & _edges(seen.range_m)
+    behind = rows[:, edge]
+    behind[:2] += LEAST_DEPTH_M * np.array((dx[edge], dy[edge])) / np.maximum(distance[edge], LEAST_DEPTH_M)
+    new: Floats = np.concatenate((rows[:, near], behind), axis=1)
+    return new
+
+
+def _edges(range_m: Floats) -> NDArray[np.bool_]:
+    """Of the beams [n] with a return, in order: whether a beam beside it saw further by more than one thing is deep [k]."""
+    padded = np.concatenate((range_m[:1], range_m, range_m[-1:]))
+    beyond = np.fmax(padded[:-2], padded[2:]) > range_m + SAME_PLACE_M
+    found: NDArray[np.bool_] = beyond[np.isfinite(range_m)]
+    return found

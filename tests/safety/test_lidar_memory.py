@@ -172,7 +172,7 @@ def test_age_widens_a_point_up_to_its_bounds():
     spread = 2.0 * 0.5 * math.pi / 180
     assert memory.points(0.0, C)[2][0] == pytest.approx(spread)
     assert memory.points(0.5, C)[2][0] == pytest.approx(spread + 0.5 * C.velocity_error_m_s)
-    assert memory.points(10.0, C)[2][0] == pytest.approx(spread + C.position_error_m)
+    assert memory.points(10.0, C)[2][0] == pytest.approx(spread + 2.0 * math.sqrt(2.0) * C.position_error_m)
     assert memory.points(1.0, config(obstacle_speed_m_s=0.5))[2][0] == pytest.approx(spread + 0.05 + 0.5)
 
 
