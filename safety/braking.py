@@ -158,6 +158,13 @@ def _stop_times_s(velocity_m_s: Floats, config: SafetyConfig) -> Floats | float:
     return times
 
 
+def stop_time_s(speed_m_s: float, config: SafetyConfig) -> float:
+    """Bound on braking distance over speed, up to a speed, s."""
+    knee = config.braking_m_s2 * config.lag_s
+    fast = max(speed_m_s, knee)
+    return (fast * fast + knee * knee) / (2.0 * config.braking_m_s2 * fast)
+
+
 def stop_gain_s(config: SafetyConfig) -> float:
     """How far, at most, the stop point moves per m/s of a command held for one tick, s (unsaturated loop)."""
     gains = (

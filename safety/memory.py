@@ -41,15 +41,15 @@ class ObstacleMemory:
         """Take in a new scan: drop what it looked at again or what is old or out of reach, add its returns."""
         old = self._points[:, : self._count]
         if self._count:
-            old = old[:, self._kept(seen, reach_m, config)]
-        near = (seen.x_m - seen.origin_x_m) ** 2 + (seen.y_m - seen.origin_y_m) ** 2 < reach_m * reach_m
-        new = np.empty((4, int(np.count_nonzero(near))))
-        new[0], new[1], new[2], new[3] = seen.x_m[near], seen.y_m[near], seen.spread_m[near], seen.time_s
-        new = new[:, :CAPACITY]
-        old = old[:, max(0, old.shape[1] + new.shape[1] - CAPACITY) :]
-        split, end = old.shape[1], old.shape[1] + new.shape[1]
-        self._points[:, :split] = old.copy()
-        self._points[:, split:end] = new
+            old = old.take(self._kept(seen, reach_m, config).nonzero()[0], axis=1)
+        dx, dy = seen.x_m - seen.origin_x_m, seen.y_m - seen.origin_y_m
+        near = (dx * dx + dy * dy < reach_m * reach_m).nonzero()[0][:CAPACITY]
+        split = min(old.shape[1], CAPACITY - near.shape[0])
+        end = split + near.shape[0]
+        self._points[:, :split] = old[:, old.shape[1] - split :]
+        for row, values in zip(self._points, (seen.x_m, seen.y_m, seen.spread_m), strict=False):
+            row[split:end] = values.take(near)
+        self._points[3, split:end] = seen.time_s
         self._count = end
 
     def _kept(self, seen: SeenScan, reach_m: float, config: SafetyConfig) -> NDArray[np.bool_]:
@@ -67,9 +67,11 @@ class ObstacleMemory:
     @staticmethod
     def _reach(seen: SeenScan, direction_rad: Floats) -> Floats:
         """How far the beam in each direction [k] saw: inf = nothing there, nan = no beam or an unknown one, m."""
+        beams = seen.range_m.shape[0]
+        saw = np.empty(beams + 1)
+        saw[:beams], saw[beams] = seen.range_m, np.nan  # beyond the last beam nothing is seen
         beam = np.rint(scan_offset(seen, direction_rad - seen.yaw_rad) / seen.angle_increment_rad)
-        inside = beam < seen.range_m.shape[0]
-        reach: Floats = np.where(inside, seen.range_m[np.where(inside, beam, 0.0).astype(np.intp)], np.nan)
+        reach: Floats = saw.take(np.minimum(beam, beams).astype(np.intp))
         return reach
 
     @property

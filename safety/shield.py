@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from safety.allowance import EPSILON_M, Allowance, allowance, held_in
 from safety.braking import Start, Tubes, slow_after_s, tubes
 from safety.config import SafetyConfig
-from safety.fence_tube import FenceGuard, NearFence, WaysOut
+from safety.fence_tube import FenceGuard, NearFence, Room, WaysOut
 from safety.frames import CorridorVector
 from safety.messages import Intervention
+from safety.open_space import TubeBox, climb_room_m, kept_to_points_m
 from safety.sight import Hidden, Sight, View
 
 Floats = NDArray[np.float64]
@@ -81,9 +82,12 @@ class Shield:
 
         `within_limits`: which of some candidates [c, 3] may be sent at all after the command sent last.
         """
+        room, clearance = self._guard.here(around.position), self._clearance_now(around)
+        if self._in_the_open(wanted, around, room):
+            return Decision(wanted, (), clearance, room.least_m)
         reach = self._reach_m(around.start)
         near = self._guard.look(around.position, around.start, reach)
-        clearance, fence_margin = self._clearance_now(around), near.room_m
+        fence_margin = near.room_m
         around = self._within_reach(around, reach)
         limit = self._speed_limit(around, clearance, fence_margin)
         first = np.zeros((2, 3))
@@ -102,6 +106,16 @@ class Shield:
             due = WAY_SHARES * self._due(around, near, bounds.allowed)
             chosen = due[within_limits(due).argmax()]
         return Decision(_vector(chosen), tuple(found), clearance, fence_margin)
+
+    def _in_the_open(self, wanted: CorridorVector, around: Surroundings, room: Room) -> bool:
+        """Whether bounds alone show that neither points nor fence nor unseen space are anywhere near."""
+        config = self._config
+        box = TubeBox.around(around.position, around.start, wanted, config)
+        return (
+            box.inside(around.position, room, climb_room_m(wanted, config))
+            and box.apart_from(around.x_m, around.y_m, around.extra_m + kept_to_points_m(box, config))
+            and self._sight.all_clear(box.low_m, box.high_m, around.view)
+        )
 
     def _speed_limit(self, around: Surroundings, clearance_m: float, fence_margin_m: float) -> float:
         """Horizontal speed allowed from here: less inside a margin, outside the fence or in space never seen, m/s."""

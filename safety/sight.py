@@ -9,6 +9,7 @@ forgotten before the vehicle stands is forgotten already for a command, not yet 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,6 +85,11 @@ class Sight:
         if view.free.all_seen_around(position.x, position.y, view.now_s):  # the usual case
             return False
         return bool(view.unseen(np.array(((position.x,), (position.y,))), wide=False)[0])
+
+    def all_clear(self, low_m: Sequence[float], high_m: Sequence[float], view: View) -> bool:
+        """Whether nothing unseen is near any place between two corners (x, y), now or when the vehicle will stand."""
+        ahead_s = view.now_s + self._ahead_s
+        return view.free.all_seen_between(low_m, high_m, ahead_s) or view.free.none_hidden(low_m, high_m, view.near_m, ahead_s)
 
     def hidden(self, tube: Tubes, view: View, brake: Hidden | None = None) -> Hidden:
         """The unseen cells on each tube, of both models. Without `brake` the last tube is braking's own.

@@ -108,6 +108,7 @@ REVIEWED = {
     "scan_monitor.REFERENCE_S": 1.0,
     "scan_monitor.WRONG_SHARE": 0.5,
     "scan_monitor.WRONG_M": 0.05,
+    "open_space.ROUNDING_M": 1e-06,
     "shield.EPSILON_M": 1e-09,
     "shield.SCALES": (0.8, 0.6, 0.4, 0.2, 0.1, 0.05),
     "shield.TURNS_RAD": tuple(math.radians(a) for a in (15.0, 30.0, 45.0, 60.0, 75.0, 85.0)),
