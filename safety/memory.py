@@ -84,4 +84,6 @@ class ObstacleMemory:
         x, y, spread, time_s = self._points[:, : self._count]
         age = np.maximum(now_s - time_s, 0.0)
         drift = np.minimum(age * config.velocity_error_m_s, config.position_error_m)
+        if config.obstacle_speed_m_s == 0.0:
+            return x, y, spread + drift
         return x, y, spread + drift + np.minimum(age, MOVED_S) * config.obstacle_speed_m_s

@@ -1,6 +1,6 @@
 """The usual case, judged by bounds alone: a box around the tubes of the wanted command and of braking, with nothing in its way.
 
-What is claimed here the exact way (safety.shield) would find as well: with the vehicle clear of all margins and the whole box clear
+What is claimed here the exact way (safety.shield) would find as well: with the vehicle clear of all margins and the box clear
 of points, fence and unseen cells, braking sets no bound that the wanted command could break. Where a bound does not show it, the
 exact way decides.
 """
@@ -24,7 +24,7 @@ ROUNDING_M = 1e-6  # far more than what the exact way and the bounds differ by
 
 @dataclass(frozen=True, slots=True)
 class TubeBox:
-    """Two corners (x, y, z) of a box that holds the vehicle and the tubes of a command and of braking, both models, corridor frame."""
+    """Two corners (x, y, z) of a box around the vehicle and the tubes of a command and of braking, both models, corridor frame."""
 
     low_m: tuple[float, ...]
     high_m: tuple[float, ...]
