@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from safety.config import SafetyConfig
 from safety.lidar import SeenScan
-from safety.unseen_cells import CELL_M, Patch, Window, boxes_within, cells_of, surfaces, window_around
+from safety.unseen_cells import CELL_M, Known, Patch, Window, boxes_within, cells_in, cells_of, surfaces, window_around
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -27,7 +27,7 @@ RECENTRE_CELLS = 8  # the map follows the vehicle in steps of this size
 TAKE_OFF_M = 0.9  # at engaging nothing may stand nearer to the vehicle's centre than this, unseen by the LiDAR
 VICINITY_CELLS = 2  # around the swept hull: what is known there stays known while the vehicle stands
 STEP_M = 0.2  # between the discs that stand for a swept hull
-PATCH_CELLS = 10  # a patch is made so much wider than what is asked first: the tubes of a tick lie close together
+PATCH_CELLS = 12  # a patch is made so much wider than what is asked first: the tubes of a tick lie close together
 _REACH_ERROR_M = CELL_M * math.sqrt(2.0)  # of a cell's far corner, seen from anywhere in the cell of the LiDAR
 _WIDEST_RAD = math.radians(60.0)  # nearer cells fill more of the view: they are the vehicle's own
 NOWHERE = np.empty((2, 0))
@@ -44,6 +44,7 @@ class FreeSpace:
         self._kernels = (boxes_within(hull + CELL_M), boxes_within(hull))
         self._rims = tuple(int(boxes.max()) for boxes in self._kernels)
         self._rim = self._rims[0]
+        self._touched = cells_in(self._kernels[1], self._rims[1])
         vicinity_m = hull + (1 + VICINITY_CELLS) * CELL_M
         self._half = math.floor(max(CARVE_M, TAKE_OFF_M, vicinity_m) / CELL_M)  # of the window that a scan changes, in cells
         self._view = _ViewTemplate(self._half)
@@ -55,6 +56,7 @@ class FreeSpace:
     def clear(self) -> None:
         """Nothing was ever seen."""
         self._seen_s.fill(-np.inf)
+        self._known: Known | None = None
         self._patches: dict[float, Patch] = {}
         self._corner = (0, 0)
         self._began_s: float | None = None
@@ -62,12 +64,12 @@ class FreeSpace:
 
     def forget(self) -> None:
         """Nothing is known any more, in flight: unlike at engaging, nothing is taken for granted around the vehicle."""
-        self._patches.clear()
+        self._known = None
         self._seen_s.fill(-np.inf)
 
     def update(self, seen: SeenScan) -> None:
         """Take in a scan: what its beams went through, and where the vehicle is."""
-        self._patches.clear()
+        self._known = None
         if self._began_s is None:
             self._began_s, self._shrunk_s = seen.time_s, seen.time_s
             self._corner = (_cell(seen.origin_x_m) - SIDE_CELLS // 2, _cell(seen.origin_y_m) - SIDE_CELLS // 2)
@@ -127,7 +129,7 @@ class FreeSpace:
             return np.full(places_m.shape[1:], SIDE_CELLS * SIDE_CELLS, dtype=np.intp)
         if spared_m.shape[1]:
             patch = patch.sparing(spared_m, boxes)
-        if not patch.part(*window).any():
+        if not np.count_nonzero(patch.part(*window)):
             return np.zeros(places_m.shape[1:], dtype=np.intp)
         return patch.counted(cells, boxes, rim, wide)
 
@@ -149,6 +151,13 @@ class FreeSpace:
         window = (left - rim, below - rim, right + rim + 1, above + rim + 1)
         patch = self._patch_of(window, near_m, now_s)
         return patch is not None and not np.count_nonzero(patch.part(*window))
+
+    def hull_touches(self, x_m: float, y_m: float, near_m: Floats, now_s: float) -> bool:
+        """Whether the hull with its errors touches an unseen cell, its centre at a place."""
+        i, j, rim = _cell(x_m), _cell(y_m), self._rims[1]
+        window = (i - rim, j - rim, i + rim + 1, j + rim + 1)
+        patch = self._patch_of(window, near_m, now_s)
+        return patch is None or np.count_nonzero(patch.part(*window) & self._touched) > 0
 
     def gap_m(self, places_m: Floats, near_m: Floats, now_s: float) -> Floats:
         """Distance from places [2, n] to the nearest unseen cell, m; what is further than the hull needs reads as that."""
@@ -172,22 +181,24 @@ class FreeSpace:
         right, above = left + SIDE_CELLS, below + SIDE_CELLS
         if low_x < left or low_y < below or high_x > right or high_y > above or self._began_s is None:
             return None
-        patch = self._patches.get(now_s)
-        if patch is None or not patch.holds(*window, near_m):
+        if self._known is None or not self._known.holds(*window, near_m):
             low_x, low_y = max(low_x - PATCH_CELLS, left), max(low_y - PATCH_CELLS, below)
             high_x, high_y = min(high_x + PATCH_CELLS, right), min(high_y + PATCH_CELLS, above)
-            oldest_s = now_s - self._began_s - self._config.memory_s
-            hidden = self._hidden(low_x - left, low_y - below, high_x - left, high_y - below, near_m, oldest_s)
-            patch = Patch(near_m, low_x, low_y, hidden)
-            self._patches = {moment: old for moment, old in self._patches.items() if old.near_m is near_m} | {now_s: patch}
+            self._known = Known(near_m, low_x, low_y, surfaces(near_m, low_x, low_y, (high_x - low_x, high_y - low_y)))
+            self._patches.clear()
+        patch = self._patches.get(now_s)
+        if patch is None:
+            patch = self._patches[now_s] = Patch(
+                self._known, self._hidden(self._known, now_s - self._began_s - self._config.memory_s)
+            )
         return patch
 
-    def _hidden(self, low_x: int, low_y: int, high_x: int, high_y: int, near_m: Floats, oldest_s: float) -> Booleans:
+    def _hidden(self, known: Known, oldest_s: float) -> Booleans:
         """The unseen cells of a window of the map that belong to no known return."""
-        hidden: Booleans = self._seen_s[low_x:high_x, low_y:high_y] < oldest_s
-        if near_m.shape[1] and hidden.any():
-            hidden &= ~surfaces(near_m, low_x + self._corner[0], low_y + self._corner[1], hidden.shape)
-        return hidden
+        low_x, low_y, (rows, columns) = known.low_x - self._corner[0], known.low_y - self._corner[1], known.mask.shape
+        high_x, high_y = low_x + rows, low_y + columns
+        unseen: Booleans = self._seen_s[low_x:high_x, low_y:high_y] < oldest_s
+        return unseen & ~known.mask
 
 
 class _ViewTemplate:

@@ -84,7 +84,7 @@ class Sight:
         """Whether the vehicle is in unseen space."""
         if view.free.all_seen_around(position.x, position.y, view.now_s):  # the usual case
             return False
-        return bool(view.unseen(np.array(((position.x,), (position.y,))), wide=False)[0])
+        return view.free.hull_touches(position.x, position.y, view.near_m, view.now_s)
 
     def all_clear(self, low_m: Sequence[float], high_m: Sequence[float], view: View) -> bool:
         """Whether nothing unseen is near any place between two corners (x, y), now or when the vehicle will stand."""

@@ -18,39 +18,48 @@ SURFACE_CELLS = 2  # cells this near to a known return belong to it
 
 
 @dataclass(frozen=True, slots=True)
-class Patch:
-    """The unseen cells of a window of the map at one moment. Every tube of a tick asks here, so sums are made once.
-
-    `low_x`, `low_y`: its first cell. `counts`: per kernel, what the hull would touch with its centre in each cell.
-    """
+class Known:
+    """The cells of a window of the map, `low_x`, `low_y` its first cell, that belong to known returns [2, k]."""
 
     near_m: Floats
     low_x: int
     low_y: int
-    hidden: Booleans
-    counts: dict[bool, Integers] = field(default_factory=dict)
+    mask: Booleans
 
     def holds(self, low_x: int, low_y: int, high_x: int, high_y: int, near_m: Floats) -> bool:
         """Whether it was made for the same returns and is large enough."""
-        rows, columns = self.hidden.shape
+        rows, columns = self.mask.shape
         inside = low_x >= self.low_x and low_y >= self.low_y and high_x <= self.low_x + rows and high_y <= self.low_y + columns
         return inside and near_m is self.near_m
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """The unseen cells of a window of the map at one moment. Every tube of a tick asks here, so sums are made once.
+
+    `counts`: per kernel, what the hull would touch with its centre in each cell.
+    """
+
+    known: Known
+    hidden: Booleans
+    counts: dict[bool, Integers] = field(default_factory=dict)
 
     def sparing(self, places_m: Floats, boxes: Integers) -> Patch:
         """The same without the cells of the boxes around places [2, n]."""
         hidden, cells = self.hidden.copy(), cells_of(places_m)
-        _clear(hidden, boxes, cells[0] - self.low_x, cells[1] - self.low_y)
-        return Patch(self.near_m, self.low_x, self.low_y, hidden)
+        _clear(hidden, boxes, cells[0] - self.known.low_x, cells[1] - self.known.low_y)
+        return Patch(self.known, hidden)
 
     def part(self, low_x: int, low_y: int, high_x: int, high_y: int) -> Booleans:
         """The unseen cells of a smaller window."""
-        return self.hidden[low_x - self.low_x : high_x - self.low_x, low_y - self.low_y : high_y - self.low_y]
+        x, y = self.known.low_x, self.known.low_y
+        return self.hidden[low_x - x : high_x - x, low_y - y : high_y - y]
 
     def counted(self, cells: Integers, boxes: Integers, rim: int, wide: bool) -> Integers:
         """The weighted sums of a kernel's boxes at cells [2, ...]."""
         if wide not in self.counts:
             self.counts[wide] = _box_counts(self.hidden, boxes, rim)
-        found: Integers = self.counts[wide][cells[0] - (self.low_x + rim), cells[1] - (self.low_y + rim)]
+        found: Integers = self.counts[wide][cells[0] - (self.known.low_x + rim), cells[1] - (self.known.low_y + rim)]
         return found
 
 
@@ -91,6 +100,13 @@ def boxes_within(radius_m: float) -> Integers:
     widths = [(i, 1 + math.floor(math.sqrt(reach * reach - max(i - 1, 0) ** 2))) for i in range(math.floor(reach) + 2)]
     corners = [box for box, after in zip(widths, [*widths[1:], (0, -1)], strict=True) if after[1] < box[1]]
     return np.array(corners)
+
+
+def cells_in(boxes: Integers, rim: int) -> Booleans:
+    """Which cells of a square, up to `rim` from the middle one, lie in any of the boxes around it."""
+    middle = np.ones((2 * rim + 1, 2 * rim + 1), dtype=np.bool_)
+    _clear(middle, boxes, np.array([rim]), np.array([rim]))
+    return ~middle
 
 
 def _clear(hidden: Booleans, boxes: Integers, i: Integers, j: Integers) -> None:

@@ -66,7 +66,7 @@ REVIEWED = {
     "free_space.SIDE_CELLS": 128,
     "free_space.CARVE_M": 2.5,
     "free_space.RECENTRE_CELLS": 8,
-    "free_space.PATCH_CELLS": 10,
+    "free_space.PATCH_CELLS": 12,
     "unseen_cells.CELL_M": 0.1,
     "unseen_cells.SURFACE_CELLS": 2,
     "free_space.TAKE_OFF_M": 0.9,
