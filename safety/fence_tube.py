@@ -38,13 +38,12 @@ class Room:
 
 @dataclass(frozen=True, slots=True)
 class NearFence:
-    """The part of the fence that matters this tick. `room_m`: the vehicle now, beyond the erosion, negative where too near.
+    """The part of the fence that matters this tick.
 
     `edges` [e], `vertices` [e]: within reach; `pieces` [2 e]: both. `outside`: control begins on the forbidden side of some
     polygon.
     """
 
-    room_m: float
     edges: Segments
     vertices: Segments
     pieces: Segments
@@ -86,10 +85,10 @@ class FenceGuard:
     def look(self, position: CorridorVector, start: Start, reach_m: float) -> NearFence:
         """Take what tubes from `start` can come near to when they reach `reach_m`, and all of a polygon already breached."""
         fence, place, within_m = self._fence, (position.x, position.y), reach_m + self._corner_m
-        room, begins = self.here(position).least_m, start.position_m[:, :2]
+        begins = start.position_m[:, :2]
         far_m = within_m + max(math.dist(place, begin) for begin in begins.tolist())
         if self._far is not None and self._far.clear_of(far_m, place):
-            return NearFence(room, *self._nothing, outside=False)
+            return NearFence(*self._nothing, outside=False)
         measured = fence.measured(begins)
         near = measured.edge_m.min(axis=0) < within_m
         breached = measured.margin_m.min(axis=0) < 0.0
@@ -98,7 +97,7 @@ class FenceGuard:
             near |= breached[fence.edges.ring]
         if near.tobytes() != self._taken_key:  # mostly the same pieces as a tick ago: kept
             self._taken, self._taken_key = self._take(near), near.tobytes()
-        return NearFence(room, *self._taken, outside)
+        return NearFence(*self._taken, outside)
 
     def _take(self, near: Booleans) -> tuple[Segments, Segments, Segments]:
         """Some edges, their first vertices, and both."""
@@ -175,7 +174,7 @@ def _crossed(edges: Segments, along: Floats, across: Floats, start: Start) -> Bo
 def _crossing(edges: Segments, along_a: Floats, across_a: Floats, along_b: Floats, across_b: Floats) -> Booleans:
     """Whether straight ways from a to b cross the segments themselves."""
     changed: Booleans = (across_a < 0.0) != (across_b < 0.0)
-    if not changed.any():
+    if not np.count_nonzero(changed):
         return changed
     share = across_a / np.where(changed, across_a - across_b, 1.0)
     at = along_a + share * (along_b - along_a)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from safety.config import SafetyConfig
 from safety.lidar import SeenScan
-from safety.unseen_cells import CELL_M, Known, Patch, Window, boxes_within, cells_in, cells_of, surfaces, window_around
+from safety.unseen_cells import CELL_M, Counts, Known, Patch, Window, boxes_within, cells_in, cells_of, surfaces, window_around
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -114,7 +114,7 @@ class FreeSpace:
                 np.minimum(grid[:-1], grid[1:], out=self._spare[:-1])
                 np.minimum(self._spare[:-2], grid[2:], out=grid[1:-1])
 
-    def unseen(self, places_m: Floats, near_m: Floats, now_s: float, wide: bool, spared_m: Floats = NOWHERE) -> Integers:
+    def unseen(self, places_m: Floats, near_m: Floats, now_s: float, wide: bool, spared_m: Floats = NOWHERE) -> Counts:
         """How many unseen cells the hull touches with its centre at places [2, ...]; weighted, 0 = none.
 
         The hull with its errors, one cell more when `wide`. `near_m` [2, k]: known returns, whose surroundings count as known.
@@ -130,7 +130,7 @@ class FreeSpace:
         if spared_m.shape[1]:
             patch = patch.sparing(spared_m, boxes)
         if not np.count_nonzero(patch.part(*window)):
-            return np.zeros(places_m.shape[1:], dtype=np.intp)
+            return np.zeros(places_m.shape[1:], dtype=np.int32)
         return patch.counted(cells, boxes, rim, wide)
 
     def all_seen_around(self, x_m: float, y_m: float, now_s: float) -> bool:
@@ -157,7 +157,7 @@ class FreeSpace:
         i, j, rim = _cell(x_m), _cell(y_m), self._rims[1]
         window = (i - rim, j - rim, i + rim + 1, j + rim + 1)
         patch = self._patch_of(window, near_m, now_s)
-        return patch is None or np.count_nonzero(patch.part(*window) & self._touched) > 0
+        return patch is None or bool(np.count_nonzero(patch.part(*window) & self._touched))
 
     def gap_m(self, places_m: Floats, near_m: Floats, now_s: float) -> Floats:
         """Distance from places [2, n] to the nearest unseen cell, m; what is further than the hull needs reads as that."""

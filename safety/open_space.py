@@ -24,7 +24,7 @@ ROUNDING_M = 1e-6  # far more than what the exact way and the bounds differ by
 
 @dataclass(frozen=True, slots=True)
 class TubeBox:
-    """Two corners (x, y, z) of a box around the vehicle and the tubes of a command and of braking, both models, corridor frame."""
+    """Two corners (x, y, z) of a box around the vehicle and all tubes of a command and of braking, corridor frame, m."""
 
     low_m: tuple[float, ...]
     high_m: tuple[float, ...]

@@ -87,11 +87,9 @@ class Shield:
             return Decision(wanted, (), clearance, room.least_m)
         reach = self._reach_m(around.start)
         near = self._guard.look(around.position, around.start, reach)
-        fence_margin = near.room_m
-        around = self._within_reach(around, reach)
+        fence_margin, around = room.least_m, self._within_reach(around, reach)
         limit = self._speed_limit(around, clearance, fence_margin)
-        first = np.zeros((2, 3))
-        first[0] = wanted.x, wanted.y, wanted.z
+        first = np.array(((wanted.x, wanted.y, wanted.z), (0.0, 0.0, 0.0)))
         speed = math.hypot(wanted.x, wanted.y)
         found = [Intervention("return_speed", speed, limit)] if speed > limit else []
         first = _capped(first, limit)
@@ -159,7 +157,7 @@ class Shield:
         tube = tubes(around.start, first, self._config)
         clear, fence = self._tube_clearances(tube, around), self._guard.rooms_m(tube, around.start, near)
         points, position = np.array((around.x_m, around.y_m)), np.array((around.position.x, around.position.y))
-        pressed = (fence[1, :-2] < 0.0).any() or (clear[1] < 0.0).any()
+        pressed = np.count_nonzero(fence[1, :-2] < 0.0) + np.count_nonzero(clear[1] < 0.0)
         ways = self._guard.ways_out(tube, near) if pressed else None
         allowed = allowance(tube, clear[1], fence[1], points, position, ways, self._config)
         hidden = self._sight.hidden(tube, around.view)
@@ -279,8 +277,8 @@ def _leg_clearances(tube: Tubes, error_m: float, grown_m: Floats | float, around
     begin_m, end_m = tube.turn_m, tube.stop_m
     if around.x_m.shape[0] == 0:
         return np.empty((begin_m.shape[1], 0))
-    ax, ay = begin_m[..., 0].reshape(-1, 1), begin_m[..., 1].reshape(-1, 1)
-    dx, dy = end_m[..., 0].reshape(-1, 1) - ax, end_m[..., 1].reshape(-1, 1) - ay
+    ax, ay, _ = begin_m.reshape(-1, 3).T[..., None]
+    dx, dy, _ = (end_m - begin_m).reshape(-1, 3).T[..., None]
     rx, ry = around.x_m - ax, around.y_m - ay
     along = (rx * dx + ry * dy) / np.maximum(dx * dx + dy * dy, 1e-12)
     np.minimum(np.maximum(along, 0.0, out=along), 1.0, out=along)

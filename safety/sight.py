@@ -19,9 +19,9 @@ from safety.braking import Tubes
 from safety.config import SafetyConfig
 from safety.frames import CorridorVector
 from safety.free_space import NOWHERE, STEP_M, FreeSpace
+from safety.unseen_cells import Counts
 
 Floats = NDArray[np.float64]
-Integers = NDArray[np.intp]
 Booleans = NDArray[np.bool_]
 ROUNDING_M = 1e-9
 STANDING_AFTER = 2.0  # blind times until less of the way is left than what stays known around a vehicle
@@ -35,14 +35,15 @@ class View:
     near_m: Floats
     now_s: float
 
-    def unseen(self, places_m: Floats, wide: bool, ahead_s: float = 0.0, spared_m: Floats = NOWHERE) -> Integers:
+    def unseen(self, places_m: Floats, wide: bool, ahead_s: float = 0.0, spared_m: Floats = NOWHERE) -> Counts:
         """How many unseen cells the hull touches at places [2, ...], now or some time ahead."""
         return self.free.unseen(places_m, self.near_m, self.now_s + ahead_s, wide, spared_m)
 
     def all_seen(self, begin_m: Floats, end_m: Floats, ahead_s: float) -> bool:
         """Whether all is seen around straight legs [..., 3]: quick, and False where it must be counted."""
         ends = np.concatenate((begin_m, end_m)).reshape(-1, 3)
-        return self.free.all_seen_between(ends.min(axis=0).tolist(), ends.max(axis=0).tolist(), self.now_s + ahead_s)
+        low, high = np.minimum.reduce(ends).tolist(), np.maximum.reduce(ends).tolist()
+        return self.free.all_seen_between(low, high, self.now_s + ahead_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +54,10 @@ class Hidden:
     `gap_m` [c]: from the stop points to the nearest unseen cell. `brake_m` [2, n]: places on the way of braking.
     """
 
-    soon: Integers
-    wide: Integers
-    exact: Integers
-    more: Integers
+    soon: Counts
+    wide: Counts
+    exact: Counts
+    more: Counts
     gap_m: Floats
     brake_m: Floats
 
@@ -98,9 +99,9 @@ class Sight:
         """
         leg = tube.stop_m - tube.turn_m
         if view.all_seen(tube.turn_m, tube.stop_m, self._ahead_s):  # the usual case
-            return _seen(np.zeros(leg.shape[1], dtype=np.intp))
-        along = leg.transpose(2, 0, 1)[:2, :, :, None] * self._shares
-        places = tube.turn_m.transpose(2, 0, 1)[:2, :, :, None] + along
+            return _seen(np.zeros(leg.shape[1], dtype=np.int32))
+        places = leg.transpose(2, 0, 1)[:2, :, :, None] * self._shares
+        places += tube.turn_m.transpose(2, 0, 1)[:2, :, :, None]
         soon = view.unseen(places, True, self._ahead_s).max(axis=(0, 2))
         if (soon if brake is None else brake.soon)[-1] == 0:
             return _seen(soon)
@@ -111,6 +112,6 @@ class Sight:
         return Hidden(soon, wide, exact, more, gaps, braking)
 
 
-def _seen(soon: Integers) -> Hidden:
+def _seen(soon: Counts) -> Hidden:
     """Where braking touches nothing unseen, one count is enough."""
     return Hidden(soon, soon, soon, soon, np.zeros(soon.shape), NOWHERE)
