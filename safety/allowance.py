@@ -140,7 +140,7 @@ def _outward(
     here = points_m - position_m[:, None]
     depth_here = config.keep_out_m - slide - np.sqrt((here * here).sum(axis=0))
     depth = np.maximum(-clear_m - slide, depth_here)
-    if not fenced and not (depth > 0.0).any():  # the usual case
+    if not fenced and not np.count_nonzero(depth > 0.0):  # the usual case
         return _NO_NORMALS, _NO_SPEEDS
     near = depth > -NEAR_M
     near_now, depth, points = (depth_here >= depth)[near], depth[near], points_m[:, near]
@@ -166,7 +166,7 @@ def _way_out_m_s(normals: Floats, due_m_s: Floats, config: SafetyConfig) -> Floa
     weight = np.where(due > 0.0, 1.0, BOUND_WEIGHT)
     for _ in range(PUSH_ROUNDS):
         unmet = due > way @ held
-        if not unmet.any():
+        if not np.count_nonzero(unmet):
             break
         active, weighted = held[:, unmet], held[:, unmet] * weight[unmet]
         way[:] = np.linalg.solve(weighted @ active.T + EPSILON_M * np.eye(2), weighted @ due[unmet])

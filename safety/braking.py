@@ -151,11 +151,18 @@ def _stop_times_s(velocity_m_s: Floats, config: SafetyConfig) -> Floats | float:
     """Braking distance over speed, vectors with last axis 3: the lag, more when the deceleration limit binds, s."""
     speed = np.sqrt(np.einsum("...i,...i->...", velocity_m_s, velocity_m_s))[..., None]
     knee = config.braking_m_s2 * config.lag_s
-    if not (speed > knee).any():  # the usual case: the same for all
+    if not np.count_nonzero(speed > knee):  # the usual case: the same for all
         return (knee * knee + knee * knee) / (2.0 * config.braking_m_s2 * knee)
     fast = np.maximum(speed, knee)
     times: Floats = (fast * fast + knee * knee) / (2.0 * config.braking_m_s2 * fast)
     return times
+
+
+def stop_time_s(speed_m_s: float, config: SafetyConfig) -> float:
+    """Bound on braking distance over speed, up to a speed, s."""
+    knee = config.braking_m_s2 * config.lag_s
+    fast = max(speed_m_s, knee)
+    return (fast * fast + knee * knee) / (2.0 * config.braking_m_s2 * fast)
 
 
 def stop_gain_s(config: SafetyConfig) -> float:

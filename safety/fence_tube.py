@@ -23,14 +23,27 @@ _LEAST_M2 = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
+class Room:
+    """How much further than the erosion asks the vehicle is from the polygons, floor and ceiling, negative where too near, m."""
+
+    sideways_m: float
+    below_m: float
+    above_m: float
+
+    @property
+    def least_m(self) -> float:
+        """The least of them."""
+        return min(self.sideways_m, self.below_m, self.above_m)
+
+
+@dataclass(frozen=True, slots=True)
 class NearFence:
-    """The part of the fence that matters this tick. `room_m`: the vehicle now, beyond the erosion, negative where too near.
+    """The part of the fence that matters this tick.
 
     `edges` [e], `vertices` [e]: within reach; `pieces` [2 e]: both. `outside`: control begins on the forbidden side of some
     polygon.
     """
 
-    room_m: float
     edges: Segments
     vertices: Segments
     pieces: Segments
@@ -58,26 +71,33 @@ class FenceGuard:
         self._taken, self._taken_key = self._nothing, b""
         self._far: FarInside | None = None
 
+    def here(self, position: CorridorVector) -> Room:
+        """What room the vehicle has now. Measured anew only where it may be outside, or has left what was measured last."""
+        place = (position.x, position.y)
+        below, above = position.z - self._low_z, self._high_z - position.z
+        if self._far is None or not self._far.clear_of(0.0, place):
+            measured = self._fence.measured(np.array((place,)))
+            self._far = FarInside.at(place, measured, 0, self._fence) if measured.margin_m.min() > 0.0 else None
+            if self._far is None:
+                return Room(float(measured.room_m(self._fence)[0]), below, above)
+        return Room(self._far.room_m(place), below, above)
+
     def look(self, position: CorridorVector, start: Start, reach_m: float) -> NearFence:
         """Take what tubes from `start` can come near to when they reach `reach_m`, and all of a polygon already breached."""
         fence, place, within_m = self._fence, (position.x, position.y), reach_m + self._corner_m
-        upright = min(position.z - self._low_z, self._high_z - position.z)
-        begins = start.position_m[:, :2].tolist()
-        far_m = within_m + max(math.dist(place, begin) for begin in begins)
+        begins = start.position_m[:, :2]
+        far_m = within_m + max(math.dist(place, begin) for begin in begins.tolist())
         if self._far is not None and self._far.clear_of(far_m, place):
-            return NearFence(min(self._far.room_m(place), upright), *self._nothing, outside=False)
-        measured = fence.measured(np.array((place, *begins)))
-        if measured.edge_m[0].min() > far_m and measured.margin_m[0].min() > 0.0:
-            self._far = FarInside.at(place, measured, 0, fence)
-        room = min(float(measured.room_m(fence)[0]), upright)
-        near = measured.edge_m[1:].min(axis=0) < within_m
-        breached = measured.margin_m[1:].min(axis=0) < 0.0
+            return NearFence(*self._nothing, outside=False)
+        measured = fence.measured(begins)
+        near = measured.edge_m.min(axis=0) < within_m
+        breached = measured.margin_m.min(axis=0) < 0.0
         outside = bool(breached.any())
         if outside:
             near |= breached[fence.edges.ring]
         if near.tobytes() != self._taken_key:  # mostly the same pieces as a tick ago: kept
             self._taken, self._taken_key = self._take(near), near.tobytes()
-        return NearFence(room, *self._taken, outside)
+        return NearFence(*self._taken, outside)
 
     def _take(self, near: Booleans) -> tuple[Segments, Segments, Segments]:
         """Some edges, their first vertices, and both."""
@@ -154,7 +174,7 @@ def _crossed(edges: Segments, along: Floats, across: Floats, start: Start) -> Bo
 def _crossing(edges: Segments, along_a: Floats, across_a: Floats, along_b: Floats, across_b: Floats) -> Booleans:
     """Whether straight ways from a to b cross the segments themselves."""
     changed: Booleans = (across_a < 0.0) != (across_b < 0.0)
-    if not changed.any():
+    if not np.count_nonzero(changed):
         return changed
     share = across_a / np.where(changed, across_a - across_b, 1.0)
     at = along_a + share * (along_b - along_a)

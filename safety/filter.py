@@ -6,7 +6,6 @@ raises ends in BRAKE (zero velocity) with a reason.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 from safety.braking import CommandHistory, predict_start
@@ -98,10 +97,8 @@ class SafetyFilter:
             sent, verdict = _braked(*(judged.faults or (Intervention("input_missing", math.nan, math.nan),)))
         else:
             sent, verdict = self._steer(command, state, judged.scan, now_s, judged)
-        told = verdict.interventions + judged.notices
-        return sent, dataclasses.replace(
-            verdict, interventions=told, scan_age_s=_age(scan, now_s), state_age_s=_age(state, now_s)
-        )
+        told, ages = verdict.interventions + judged.notices, (_age(scan, now_s), _age(state, now_s))
+        return sent, Verdict(verdict.braking, told, *ages, verdict.clearance_m, verdict.fence_margin_m, verdict.fault)
 
     def _steer(
         self, command: VelocityCommand, state: VehicleState, scan: LidarScan, now_s: float, judged: Judgement

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from safety.config import SafetyConfig
 from safety.lidar import SeenScan
-from safety.unseen_cells import CELL_M, Patch, Window, boxes_within, cells_of, surfaces, window_around
+from safety.unseen_cells import CELL_M, Counts, Known, Patch, Window, boxes_within, cells_in, cells_of, surfaces, window_around
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -27,7 +27,7 @@ RECENTRE_CELLS = 8  # the map follows the vehicle in steps of this size
 TAKE_OFF_M = 0.9  # at engaging nothing may stand nearer to the vehicle's centre than this, unseen by the LiDAR
 VICINITY_CELLS = 2  # around the swept hull: what is known there stays known while the vehicle stands
 STEP_M = 0.2  # between the discs that stand for a swept hull
-PATCH_CELLS = 10  # a patch is made so much wider than what is asked first: the tubes of a tick lie close together
+PATCH_CELLS = 12  # a patch is made so much wider than what is asked first: the tubes of a tick lie close together
 _REACH_ERROR_M = CELL_M * math.sqrt(2.0)  # of a cell's far corner, seen from anywhere in the cell of the LiDAR
 _WIDEST_RAD = math.radians(60.0)  # nearer cells fill more of the view: they are the vehicle's own
 NOWHERE = np.empty((2, 0))
@@ -38,20 +38,25 @@ class FreeSpace:
 
     def __init__(self, config: SafetyConfig) -> None:
         self._config = config
-        self._view = _ViewTemplate()
         self._seen_s = np.empty((SIDE_CELLS, SIDE_CELLS), dtype=np.float32)  # since the first scan; -inf = never
         self._spare = np.empty_like(self._seen_s)
         hull = config.vehicle_radius_m + config.position_error_m + config.velocity_error_m_s * config.delay_s + _sagitta_m(config)
         self._kernels = (boxes_within(hull + CELL_M), boxes_within(hull))
         self._rims = tuple(int(boxes.max()) for boxes in self._kernels)
         self._rim = self._rims[0]
-        self._hull = _disc(config.vehicle_radius_m)
-        self._vicinity = _disc(hull + (1 + VICINITY_CELLS) * CELL_M)
+        self._touched = cells_in(self._kernels[1], self._rims[1])
+        vicinity_m = hull + (1 + VICINITY_CELLS) * CELL_M
+        self._half = math.floor(max(CARVE_M, TAKE_OFF_M, vicinity_m) / CELL_M)  # of the window that a scan changes, in cells
+        self._view = _ViewTemplate(self._half)
+        self._take_off = _disc(TAKE_OFF_M, self._half)
+        self._hull = _disc(config.vehicle_radius_m, self._half)
+        self._vicinity = _disc(vicinity_m, self._half)
         self.clear()
 
     def clear(self) -> None:
         """Nothing was ever seen."""
         self._seen_s.fill(-np.inf)
+        self._known: Known | None = None
         self._patches: dict[float, Patch] = {}
         self._corner = (0, 0)
         self._began_s: float | None = None
@@ -59,29 +64,30 @@ class FreeSpace:
 
     def forget(self) -> None:
         """Nothing is known any more, in flight: unlike at engaging, nothing is taken for granted around the vehicle."""
-        self._patches.clear()
+        self._known = None
         self._seen_s.fill(-np.inf)
 
     def update(self, seen: SeenScan) -> None:
         """Take in a scan: what its beams went through, and where the vehicle is."""
-        self._patches.clear()
+        self._known = None
         if self._began_s is None:
             self._began_s, self._shrunk_s = seen.time_s, seen.time_s
             self._corner = (_cell(seen.origin_x_m) - SIDE_CELLS // 2, _cell(seen.origin_y_m) - SIDE_CELLS // 2)
-            own = _disc(TAKE_OFF_M)
+            own = self._take_off
         else:
             self._follow(seen.origin_x_m, seen.origin_y_m)
             own = self._hull
         time_s = seen.time_s - self._began_s
-        here = (_cell(seen.origin_x_m) - self._corner[0]) * SIDE_CELLS + _cell(seen.origin_y_m) - self._corner[1]
-        cells = self._seen_s.reshape(-1)
-        near = here + self._vicinity
-        known = near[cells[near] >= time_s - self._config.memory_s]
+        i, j = self._corner_cells((seen.origin_x_m, seen.origin_y_m))
+        half = self._half
+        window = self._seen_s[i - half : i + half + 1, j - half : j + half + 1]
+        free = window >= time_s - self._config.memory_s
+        free &= self._vicinity
+        free |= own
+        free |= self._view.visible(seen, self._config)
         if self._config.obstacle_speed_m_s > 0.0:
             self._shrink(seen.time_s)
-        cells[known] = time_s
-        cells[here + own] = time_s
-        cells[here + self._view.visible(seen, self._config)] = time_s
+        window[free] = time_s
 
     def _follow(self, x_m: float, y_m: float) -> None:
         """Move the map by whole steps once the vehicle is more than a step off its centre."""
@@ -108,7 +114,7 @@ class FreeSpace:
                 np.minimum(grid[:-1], grid[1:], out=self._spare[:-1])
                 np.minimum(self._spare[:-2], grid[2:], out=grid[1:-1])
 
-    def unseen(self, places_m: Floats, near_m: Floats, now_s: float, wide: bool, spared_m: Floats = NOWHERE) -> Integers:
+    def unseen(self, places_m: Floats, near_m: Floats, now_s: float, wide: bool, spared_m: Floats = NOWHERE) -> Counts:
         """How many unseen cells the hull touches with its centre at places [2, ...]; weighted, 0 = none.
 
         The hull with its errors, one cell more when `wide`. `near_m` [2, k]: known returns, whose surroundings count as known.
@@ -123,8 +129,8 @@ class FreeSpace:
             return np.full(places_m.shape[1:], SIDE_CELLS * SIDE_CELLS, dtype=np.intp)
         if spared_m.shape[1]:
             patch = patch.sparing(spared_m, boxes)
-        if not patch.part(*window).any():
-            return np.zeros(places_m.shape[1:], dtype=np.intp)
+        if not np.count_nonzero(patch.part(*window)):
+            return np.zeros(places_m.shape[1:], dtype=np.int32)
         return patch.counted(cells, boxes, rim, wide)
 
     def all_seen_around(self, x_m: float, y_m: float, now_s: float) -> bool:
@@ -138,6 +144,20 @@ class FreeSpace:
             return False
         around = self._seen_s[left - rim : right + rim + 1, below - rim : above + rim + 1]
         return bool(around.min() >= now_s - self._began_s - self._config.memory_s)
+
+    def none_hidden(self, low_m: Sequence[float], high_m: Sequence[float], near_m: Floats, now_s: float) -> bool:
+        """The same where cells of known returns are seen, too."""
+        (left, below), (right, above), rim = map(_cell, low_m[:2]), map(_cell, high_m[:2]), self._rim
+        window = (left - rim, below - rim, right + rim + 1, above + rim + 1)
+        patch = self._patch_of(window, near_m, now_s)
+        return patch is not None and not np.count_nonzero(patch.part(*window))
+
+    def hull_touches(self, x_m: float, y_m: float, near_m: Floats, now_s: float) -> bool:
+        """Whether the hull with its errors touches an unseen cell, its centre at a place."""
+        i, j, rim = _cell(x_m), _cell(y_m), self._rims[1]
+        window = (i - rim, j - rim, i + rim + 1, j + rim + 1)
+        patch = self._patch_of(window, near_m, now_s)
+        return patch is None or bool(np.count_nonzero(patch.part(*window) & self._touched))
 
     def gap_m(self, places_m: Floats, near_m: Floats, now_s: float) -> Floats:
         """Distance from places [2, n] to the nearest unseen cell, m; what is further than the hull needs reads as that."""
@@ -161,28 +181,31 @@ class FreeSpace:
         right, above = left + SIDE_CELLS, below + SIDE_CELLS
         if low_x < left or low_y < below or high_x > right or high_y > above or self._began_s is None:
             return None
-        patch = self._patches.get(now_s)
-        if patch is None or not patch.holds(*window, near_m):
+        if self._known is None or not self._known.holds(*window, near_m):
             low_x, low_y = max(low_x - PATCH_CELLS, left), max(low_y - PATCH_CELLS, below)
             high_x, high_y = min(high_x + PATCH_CELLS, right), min(high_y + PATCH_CELLS, above)
-            oldest_s = now_s - self._began_s - self._config.memory_s
-            hidden = self._hidden(low_x - left, low_y - below, high_x - left, high_y - below, near_m, oldest_s)
-            patch = Patch(near_m, low_x, low_y, hidden)
-            self._patches = {moment: old for moment, old in self._patches.items() if old.near_m is near_m} | {now_s: patch}
+            self._known = Known(near_m, low_x, low_y, surfaces(near_m, low_x, low_y, (high_x - low_x, high_y - low_y)))
+            self._patches.clear()
+        patch = self._patches.get(now_s)
+        if patch is None:
+            patch = self._patches[now_s] = Patch(
+                self._known, self._hidden(self._known, now_s - self._began_s - self._config.memory_s)
+            )
         return patch
 
-    def _hidden(self, low_x: int, low_y: int, high_x: int, high_y: int, near_m: Floats, oldest_s: float) -> Booleans:
+    def _hidden(self, known: Known, oldest_s: float) -> Booleans:
         """The unseen cells of a window of the map that belong to no known return."""
-        hidden: Booleans = self._seen_s[low_x:high_x, low_y:high_y] < oldest_s
-        if near_m.shape[1] and hidden.any():
-            hidden &= ~surfaces(near_m, low_x + self._corner[0], low_y + self._corner[1], hidden.shape)
-        return hidden
+        low_x, low_y, (rows, columns) = known.low_x - self._corner[0], known.low_y - self._corner[1], known.mask.shape
+        high_x, high_y = low_x + rows, low_y + columns
+        unseen: Booleans = self._seen_s[low_x:high_x, low_y:high_y] < oldest_s
+        return unseen & ~known.mask
 
 
 class _ViewTemplate:
-    """For each cell around the LiDAR: its bearing, how far a beam must have gone, and how many beams look at it."""
+    """For each cell of a square around the LiDAR: its bearing, how far a beam must have gone, and how many beams look at it."""
 
-    def __init__(self) -> None:
+    def __init__(self, half: int) -> None:
+        self._half = half
         self._key: tuple[float, int] | None = None
 
     def _prepare(self, seen: SeenScan) -> None:
@@ -191,27 +214,24 @@ class _ViewTemplate:
             return
         self._key, increment = key, seen.angle_increment_rad
         self._turn = math.ceil(2.0 * math.pi / increment - 1e-6)
-        span = np.arange(-math.floor(CARVE_M / CELL_M), math.floor(CARVE_M / CELL_M) + 1)
-        i, j = (part.reshape(-1) for part in np.meshgrid(span, span, indexing="ij"))
-        distance = CELL_M * np.hypot(i, j)
+        i, j, distance = _around(self._half)
         fits = (distance >= _REACH_ERROR_M / math.sin(_WIDEST_RAD)) & (distance + _REACH_ERROR_M <= CARVE_M)
-        i, j, distance = i[fits], j[fits], distance[fits]
-        beams = np.ceil(np.arcsin(_REACH_ERROR_M / distance) / increment) + 1.0  # half a beam of rounding, one of the turn's end
+        width = np.arcsin(_REACH_ERROR_M / np.where(fits, distance, CARVE_M))
+        beams = np.ceil(width / increment) + 1.0  # half a beam of rounding, one of the turn's end
         level = np.ceil(np.log2(beams)).astype(np.intp)
         self._minima = np.zeros((int(level.max()) + 1, 3 * self._turn), dtype=np.float32)
         self._beam = (np.remainder(np.arctan2(j, i), 2.0 * math.pi) / increment + 0.5).astype(np.float32)
         self._row = level * self._minima.shape[1]
-        self._needed_m = (distance + _REACH_ERROR_M).astype(np.float32)
-        self._cell = i * SIDE_CELLS + j
+        self._needed_m = np.where(fits, distance + _REACH_ERROR_M, np.inf).astype(np.float32)
 
-    def visible(self, seen: SeenScan, config: SafetyConfig) -> Integers:
-        """Offsets of the cells, relative to the LiDAR's, through all of which the beams of a scan went."""
+    def visible(self, seen: SeenScan, config: SafetyConfig) -> Booleans:
+        """The cells of the square through all of which the beams of a scan went."""
         self._prepare(seen)
         self._fill_minima(_reaches(seen, config))
         first = (seen.yaw_rad + seen.angle_min_rad) / seen.angle_increment_rad
         beam = (self._beam + (self._turn - first % self._turn)).astype(np.intp)
         beam += self._row
-        free: Integers = self._cell[self._minima.reshape(-1)[beam] >= self._needed_m]
+        free: Booleans = self._minima.take(beam) >= self._needed_m
         return free
 
     def _fill_minima(self, reach_m: Floats) -> None:
@@ -263,10 +283,13 @@ def _overlap(step: int) -> tuple[slice, slice]:
     return slice(-step, SIDE_CELLS), slice(0, SIDE_CELLS + step)
 
 
-def _disc(radius_m: float) -> Integers:
-    """Offsets of the cells whose centre is within a radius of the middle cell's."""
-    reach = math.floor(radius_m / CELL_M)
-    i, j = np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, indexing="ij")
-    within = CELL_M * np.hypot(i, j) <= radius_m
-    offsets: Integers = (i * SIDE_CELLS + j)[within]
-    return offsets
+def _around(half: int) -> tuple[Integers, Integers, Floats]:
+    """Offsets and distance of the cells of a square from its middle one, [2 half + 1, 2 half + 1] each."""
+    i, j = np.meshgrid(*[np.arange(-half, half + 1)] * 2, indexing="ij")
+    return i, j, CELL_M * np.hypot(i, j)
+
+
+def _disc(radius_m: float, half: int) -> Booleans:
+    """The cells of a square whose centre is within a radius of the middle cell's."""
+    within: Booleans = _around(half)[2] <= radius_m
+    return within

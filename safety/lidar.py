@@ -113,13 +113,17 @@ def see(scan: LidarScan, state: VehicleState, table: BeamTable, config: SafetyCo
     ahead, left, up = _levelled(table, state.roll_rad, state.pitch_rad)
     ranges = clean_ranges(scan)
     level = np.sqrt(ahead * ahead + left * left)
-    free = np.minimum(ranges, np.minimum(scan.range_max_m, TILT_BAND_M / np.maximum(np.abs(up), _LEVEL))) * level
-    hit = np.isfinite(ranges)
+    free = np.minimum(ranges, scan.range_max_m)
+    steepest = abs(math.sin(state.roll_rad)) + abs(math.sin(state.pitch_rad))
+    rise_m = (scan.range_max_m + RANGE_SLACK_M) * max(steepest, _LEVEL)  # no return is further above or below the LiDAR
     ground_m = config.ground_z_m + config.ground_band_m
-    if z + (scan.range_max_m + RANGE_SLACK_M) * min(float(up.min()), 0.0) < ground_m:  # else no beam can reach it
+    if rise_m >= TILT_BAND_M or z < ground_m + 2.0 * TILT_BAND_M:  # else tilt changes nothing
+        free = np.minimum(free, TILT_BAND_M / np.maximum(np.abs(up), _LEVEL))
+        hit = np.isfinite(ranges)
         ground = hit & (z + np.where(hit, ranges, 0.0) * up < ground_m)
         ranges[ground] = np.nan
-        hit &= ~ground
+    free *= level
+    hit = np.isfinite(ranges)
     reach, cos, sin = ranges[hit], math.cos(yaw), math.sin(yaw)
     dx, dy = reach * ahead[hit], reach * left[hit]
     return SeenScan(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +25,22 @@ class LastSent:
     acceleration: CorridorVector
 
 
+class _Vector(NamedTuple):
+    """A vector on the way to a result: made in a third of the time of a frozen message."""
+
+    x: float
+    y: float
+    z: float
+
+
+_Any = CorridorVector | _Vector
 AT_REST = LastSent(BRAKE.velocity, BRAKE.velocity)
 
 
 def sent_after(last: LastSent, velocity: CorridorVector, dt_s: float) -> LastSent:
     """What is to be remembered of a velocity command sent `dt_s` > 0 after the last one."""
     added = _minus(velocity, _scaled(last.velocity, _kept_share(velocity, last.velocity)))
-    return LastSent(velocity, _scaled(added, 1.0 / dt_s))
+    return LastSent(velocity, CorridorVector(*_scaled(added, 1.0 / dt_s)))
 
 
 def limit_command(
@@ -85,7 +95,7 @@ def _limit_speed(velocity: CorridorVector, range_max_m: float, config: SafetyCon
     if abs(z) > config.max_vertical_speed_m_s:
         found.append(Intervention("vertical_speed_limit", abs(z), config.max_vertical_speed_m_s))
         z = math.copysign(config.max_vertical_speed_m_s, z)
-    return CorridorVector(x, y, z)
+    return CorridorVector(x, y, z) if found else velocity
 
 
 def _limit_growth(
@@ -105,10 +115,10 @@ def _limit_growth(
     if share < 1.0:
         found.append(Intervention("jerk_limit", _length(added), share * _length(added)))
         added, fits = _scaled(added, share), False
-    return velocity if fits else _minus(kept, _scaled(added, -1.0))
+    return velocity if fits else CorridorVector(*_minus(kept, _scaled(added, -1.0)))
 
 
-def _share_within(added: CorridorVector, before: CorridorVector, change: float) -> float:
+def _share_within(added: _Any, before: _Any, change: float) -> float:
     """Largest share (up to 1) of `added` that is no further than `change` from the way between zero and `before`."""
     size2, before2 = _dot(added, added), _dot(before, before)
     along = _dot(added, before)
@@ -130,17 +140,17 @@ def _kept_share(velocity: CorridorVector, last: CorridorVector) -> float:
     return min(max(_dot(velocity, last) / length2, 0.0), 1.0) if length2 > 0.0 else 0.0
 
 
-def _dot(a: CorridorVector, b: CorridorVector) -> float:
+def _dot(a: _Any, b: _Any) -> float:
     return a.x * b.x + a.y * b.y + a.z * b.z
 
 
-def _length(a: CorridorVector) -> float:
+def _length(a: _Any) -> float:
     return math.sqrt(_dot(a, a))
 
 
-def _minus(a: CorridorVector, b: CorridorVector) -> CorridorVector:
-    return CorridorVector(a.x - b.x, a.y - b.y, a.z - b.z)
+def _minus(a: _Any, b: _Any) -> _Vector:
+    return _Vector(a.x - b.x, a.y - b.y, a.z - b.z)
 
 
-def _scaled(a: CorridorVector, factor: float) -> CorridorVector:
-    return CorridorVector(a.x * factor, a.y * factor, a.z * factor)
+def _scaled(a: _Any, factor: float) -> _Vector:
+    return _Vector(a.x * factor, a.y * factor, a.z * factor)

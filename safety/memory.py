@@ -2,7 +2,7 @@
 
 A return is forgotten when a newer scan sees something at its place (the newer return replaces it), when newer scans have looked
 past it for longer than one drop-out lasts, when it is older than the memory, or when it is too far away to matter. What left the
-field of view, or is hidden behind something nearer, stays.
+field of view, or is hidden behind something nearer, stays. Returns at an edge are kept with a place behind them.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ MOVED_S = (
 )
 ALONG_BOTH_AXES = math.sqrt(2.0)  # bounds of errors are per axis
 LEAST_DEPTH_M = 0.1  # nothing is taken to be thinner: a pole seen from one side can be drifted upon from the other
+NOTHING_M = 1e6  # in place of the distance where a beam met nothing
 SAME_PLACE_M = 0.2  # a return this close to a remembered one, along its beam, is the same thing seen again
 
 
@@ -45,11 +46,11 @@ class ObstacleMemory:
         """Take in a new scan: drop what it looked at again or what is old or out of reach, add its returns."""
         old = self._points[:, : self._count]
         if self._count:
-            old = old[:, self._kept(seen, reach_m, config)]
+            old = old.take(self._kept(seen, reach_m, config).nonzero()[0], axis=1)
         new = _new_points(seen, reach_m)[:, :CAPACITY]
-        old = old[:, max(0, old.shape[1] + new.shape[1] - CAPACITY) :]
-        split, end = old.shape[1], old.shape[1] + new.shape[1]
-        self._points[:, :split] = old.copy()
+        split = min(old.shape[1], CAPACITY - new.shape[1])
+        end = split + new.shape[1]
+        self._points[:, :split] = old[:, old.shape[1] - split :]
         self._points[:, split:end] = new
         self._count = end
 
@@ -68,9 +69,11 @@ class ObstacleMemory:
     @staticmethod
     def _reach(seen: SeenScan, direction_rad: Floats) -> Floats:
         """How far the beam in each direction [k] saw: inf = nothing there, nan = no beam or an unknown one, m."""
+        beams = seen.range_m.shape[0]
+        saw = np.empty(beams + 1)
+        saw[:beams], saw[beams] = seen.range_m, np.nan  # beyond the last beam nothing is seen
         beam = np.rint(scan_offset(seen, direction_rad - seen.yaw_rad) / seen.angle_increment_rad)
-        inside = beam < seen.range_m.shape[0]
-        reach: Floats = np.where(inside, seen.range_m[np.where(inside, beam, 0.0).astype(np.intp)], np.nan)
+        reach: Floats = saw.take(np.minimum(beam, beams).astype(np.intp))
         return reach
 
     @property
@@ -83,25 +86,32 @@ class ObstacleMemory:
         x, y, spread, time_s = self._points[:, : self._count]
         age = np.maximum(now_s - time_s, 0.0)
         drift = ALONG_BOTH_AXES * np.minimum(age * config.velocity_error_m_s, 2.0 * config.position_error_m)
+        if config.obstacle_speed_m_s == 0.0:
+            return x, y, spread + drift
         return x, y, spread + drift + np.minimum(age, MOVED_S) * config.obstacle_speed_m_s
 
 
 def _new_points(seen: SeenScan, reach_m: float) -> Floats:
-    """Rows x, y, spread, time of the returns within reach, and of a place behind each that is an edge: its far side is there too."""
+    """Rows x, y, spread, time of the returns within reach, then of a place behind each one at an edge: its far side is there."""
     dx, dy = seen.x_m - seen.origin_x_m, seen.y_m - seen.origin_y_m
     distance = np.sqrt(dx * dx + dy * dy)
     near = distance < reach_m
-    rows = np.array((seen.x_m, seen.y_m, seen.spread_m, np.full(distance.shape, seen.time_s)))
-    edge = near & _edges(seen.range_m)
-    behind = rows[:, edge]
-    behind[:2] += LEAST_DEPTH_M * np.array((dx[edge], dy[edge])) / np.maximum(distance[edge], LEAST_DEPTH_M)
-    new: Floats = np.concatenate((rows[:, near], behind), axis=1)
-    return new
+    plain, edge = near.nonzero()[0], (near & _edges(seen.range_m)).nonzero()[0]
+    which = np.concatenate((plain, edge))
+    rows = np.empty((4, which.shape[0]))
+    rows[0], rows[1], rows[2], rows[3] = seen.x_m.take(which), seen.y_m.take(which), seen.spread_m.take(which), seen.time_s
+    if edge.shape[0]:
+        depth = LEAST_DEPTH_M / np.maximum(distance.take(edge), LEAST_DEPTH_M)
+        rows[0, plain.shape[0] :] += depth * dx.take(edge)
+        rows[1, plain.shape[0] :] += depth * dy.take(edge)
+    return rows
 
 
 def _edges(range_m: Floats) -> NDArray[np.bool_]:
-    """Of the beams [n] with a return, in order: whether a beam beside it saw further by more than one thing is deep [k]."""
-    padded = np.concatenate((range_m[:1], range_m, range_m[-1:]))
-    beyond = np.fmax(padded[:-2], padded[2:]) > range_m + SAME_PLACE_M
-    found: NDArray[np.bool_] = beyond[np.isfinite(range_m)]
+    """Of the beams [n] with a return, in order: whether a beam beside it saw clearly further [k]."""
+    further = np.zeros(range_m.shape[0] + 1)  # from beam to beam, none before the first and after the last
+    finite_m = np.minimum(range_m, NOTHING_M)
+    further[1:-1] = finite_m[1:] - finite_m[:-1]
+    edge = (further[1:] > SAME_PLACE_M) | (further[:-1] < -SAME_PLACE_M)
+    found: NDArray[np.bool_] = edge[np.isfinite(range_m)]
     return found

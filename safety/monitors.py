@@ -243,7 +243,7 @@ class InputMonitor:
 
 def _alike(first: NDArray[np.floating], second: NDArray[np.floating]) -> bool:
     """Whether two scans are the same in every range; two unknown ranges are not the same."""
-    return first.shape == second.shape and bool((first == second).all())
+    return first.shape == second.shape and not np.count_nonzero(first != second)
 
 
 def _length(vector: CorridorVector) -> float:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from safety.allowance import EPSILON_M, Allowance, allowance, held_in
 from safety.braking import Start, Tubes, slow_after_s, tubes
 from safety.config import SafetyConfig
-from safety.fence_tube import FenceGuard, NearFence, WaysOut
+from safety.fence_tube import FenceGuard, NearFence, Room, WaysOut
 from safety.frames import CorridorVector
 from safety.messages import Intervention
+from safety.open_space import TubeBox, climb_room_m, kept_to_points_m
 from safety.sight import Hidden, Sight, View
 
 Floats = NDArray[np.float64]
@@ -81,13 +82,14 @@ class Shield:
 
         `within_limits`: which of some candidates [c, 3] may be sent at all after the command sent last.
         """
+        room, clearance = self._guard.here(around.position), self._clearance_now(around)
+        if self._in_the_open(wanted, around, room):
+            return Decision(wanted, (), clearance, room.least_m)
         reach = self._reach_m(around.start)
         near = self._guard.look(around.position, around.start, reach)
-        clearance, fence_margin = self._clearance_now(around), near.room_m
-        around = self._within_reach(around, reach)
+        fence_margin, around = room.least_m, self._within_reach(around, reach)
         limit = self._speed_limit(around, clearance, fence_margin)
-        first = np.zeros((2, 3))
-        first[0] = wanted.x, wanted.y, wanted.z
+        first = np.array(((wanted.x, wanted.y, wanted.z), (0.0, 0.0, 0.0)))
         speed = math.hypot(wanted.x, wanted.y)
         found = [Intervention("return_speed", speed, limit)] if speed > limit else []
         first = _capped(first, limit)
@@ -102,6 +104,16 @@ class Shield:
             due = WAY_SHARES * self._due(around, near, bounds.allowed)
             chosen = due[within_limits(due).argmax()]
         return Decision(_vector(chosen), tuple(found), clearance, fence_margin)
+
+    def _in_the_open(self, wanted: CorridorVector, around: Surroundings, room: Room) -> bool:
+        """Whether bounds alone show that neither points nor fence nor unseen space are anywhere near."""
+        config = self._config
+        box = TubeBox.around(around.position, around.start, wanted, config)
+        return (
+            box.inside(around.position, room, climb_room_m(wanted, config))
+            and box.apart_from(around.x_m, around.y_m, around.extra_m + kept_to_points_m(box, config))
+            and self._sight.all_clear(box.low_m, box.high_m, around.view)
+        )
 
     def _speed_limit(self, around: Surroundings, clearance_m: float, fence_margin_m: float) -> float:
         """Horizontal speed allowed from here: less inside a margin, outside the fence or in space never seen, m/s."""
@@ -145,7 +157,7 @@ class Shield:
         tube = tubes(around.start, first, self._config)
         clear, fence = self._tube_clearances(tube, around), self._guard.rooms_m(tube, around.start, near)
         points, position = np.array((around.x_m, around.y_m)), np.array((around.position.x, around.position.y))
-        pressed = (fence[1, :-2] < 0.0).any() or (clear[1] < 0.0).any()
+        pressed = np.count_nonzero(fence[1, :-2] < 0.0) + np.count_nonzero(clear[1] < 0.0)
         ways = self._guard.ways_out(tube, near) if pressed else None
         allowed = allowance(tube, clear[1], fence[1], points, position, ways, self._config)
         hidden = self._sight.hidden(tube, around.view)
@@ -265,8 +277,8 @@ def _leg_clearances(tube: Tubes, error_m: float, grown_m: Floats | float, around
     begin_m, end_m = tube.turn_m, tube.stop_m
     if around.x_m.shape[0] == 0:
         return np.empty((begin_m.shape[1], 0))
-    ax, ay = begin_m[..., 0].reshape(-1, 1), begin_m[..., 1].reshape(-1, 1)
-    dx, dy = end_m[..., 0].reshape(-1, 1) - ax, end_m[..., 1].reshape(-1, 1) - ay
+    ax, ay, _ = begin_m.reshape(-1, 3).T[..., None]
+    dx, dy, _ = (end_m - begin_m).reshape(-1, 3).T[..., None]
     rx, ry = around.x_m - ax, around.y_m - ay
     along = (rx * dx + ry * dy) / np.maximum(dx * dx + dy * dy, 1e-12)
     np.minimum(np.maximum(along, 0.0, out=along), 1.0, out=along)

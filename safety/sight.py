@@ -9,6 +9,7 @@ forgotten before the vehicle stands is forgotten already for a command, not yet 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,9 +19,9 @@ from safety.braking import Tubes
 from safety.config import SafetyConfig
 from safety.frames import CorridorVector
 from safety.free_space import NOWHERE, STEP_M, FreeSpace
+from safety.unseen_cells import Counts
 
 Floats = NDArray[np.float64]
-Integers = NDArray[np.intp]
 Booleans = NDArray[np.bool_]
 ROUNDING_M = 1e-9
 STANDING_AFTER = 2.0  # blind times until less of the way is left than what stays known around a vehicle
@@ -34,14 +35,15 @@ class View:
     near_m: Floats
     now_s: float
 
-    def unseen(self, places_m: Floats, wide: bool, ahead_s: float = 0.0, spared_m: Floats = NOWHERE) -> Integers:
+    def unseen(self, places_m: Floats, wide: bool, ahead_s: float = 0.0, spared_m: Floats = NOWHERE) -> Counts:
         """How many unseen cells the hull touches at places [2, ...], now or some time ahead."""
         return self.free.unseen(places_m, self.near_m, self.now_s + ahead_s, wide, spared_m)
 
     def all_seen(self, begin_m: Floats, end_m: Floats, ahead_s: float) -> bool:
         """Whether all is seen around straight legs [..., 3]: quick, and False where it must be counted."""
         ends = np.concatenate((begin_m, end_m)).reshape(-1, 3)
-        return self.free.all_seen_between(ends.min(axis=0).tolist(), ends.max(axis=0).tolist(), self.now_s + ahead_s)
+        low, high = np.minimum.reduce(ends).tolist(), np.maximum.reduce(ends).tolist()
+        return self.free.all_seen_between(low, high, self.now_s + ahead_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +54,10 @@ class Hidden:
     `gap_m` [c]: from the stop points to the nearest unseen cell. `brake_m` [2, n]: places on the way of braking.
     """
 
-    soon: Integers
-    wide: Integers
-    exact: Integers
-    more: Integers
+    soon: Counts
+    wide: Counts
+    exact: Counts
+    more: Counts
     gap_m: Floats
     brake_m: Floats
 
@@ -83,7 +85,12 @@ class Sight:
         """Whether the vehicle is in unseen space."""
         if view.free.all_seen_around(position.x, position.y, view.now_s):  # the usual case
             return False
-        return bool(view.unseen(np.array(((position.x,), (position.y,))), wide=False)[0])
+        return view.free.hull_touches(position.x, position.y, view.near_m, view.now_s)
+
+    def all_clear(self, low_m: Sequence[float], high_m: Sequence[float], view: View) -> bool:
+        """Whether nothing unseen is near any place between two corners (x, y), now or when the vehicle will stand."""
+        ahead_s = view.now_s + self._ahead_s
+        return view.free.all_seen_between(low_m, high_m, ahead_s) or view.free.none_hidden(low_m, high_m, view.near_m, ahead_s)
 
     def hidden(self, tube: Tubes, view: View, brake: Hidden | None = None) -> Hidden:
         """The unseen cells on each tube, of both models. Without `brake` the last tube is braking's own.
@@ -92,9 +99,9 @@ class Sight:
         """
         leg = tube.stop_m - tube.turn_m
         if view.all_seen(tube.turn_m, tube.stop_m, self._ahead_s):  # the usual case
-            return _seen(np.zeros(leg.shape[1], dtype=np.intp))
-        along = leg.transpose(2, 0, 1)[:2, :, :, None] * self._shares
-        places = tube.turn_m.transpose(2, 0, 1)[:2, :, :, None] + along
+            return _seen(np.zeros(leg.shape[1], dtype=np.int32))
+        places = leg.transpose(2, 0, 1)[:2, :, :, None] * self._shares
+        places += tube.turn_m.transpose(2, 0, 1)[:2, :, :, None]
         soon = view.unseen(places, True, self._ahead_s).max(axis=(0, 2))
         if (soon if brake is None else brake.soon)[-1] == 0:
             return _seen(soon)
@@ -105,6 +112,6 @@ class Sight:
         return Hidden(soon, wide, exact, more, gaps, braking)
 
 
-def _seen(soon: Integers) -> Hidden:
+def _seen(soon: Counts) -> Hidden:
     """Where braking touches nothing unseen, one count is enough."""
     return Hidden(soon, soon, soon, soon, np.zeros(soon.shape), NOWHERE)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 Booleans = NDArray[np.bool_]
+Counts = NDArray[np.signedinteger]
 Window = tuple[int, int, int, int]  # of cells: the first ones, and those after the last
 
 CELL_M = 0.1
@@ -18,50 +19,59 @@ SURFACE_CELLS = 2  # cells this near to a known return belong to it
 
 
 @dataclass(frozen=True, slots=True)
-class Patch:
-    """The unseen cells of a window of the map at one moment. Every tube of a tick asks here, so sums are made once.
-
-    `low_x`, `low_y`: its first cell. `counts`: per kernel, what the hull would touch with its centre in each cell.
-    """
+class Known:
+    """The cells of a window of the map, `low_x`, `low_y` its first cell, that belong to known returns [2, k]."""
 
     near_m: Floats
     low_x: int
     low_y: int
-    hidden: Booleans
-    counts: dict[bool, Integers] = field(default_factory=dict)
+    mask: Booleans
 
     def holds(self, low_x: int, low_y: int, high_x: int, high_y: int, near_m: Floats) -> bool:
         """Whether it was made for the same returns and is large enough."""
-        rows, columns = self.hidden.shape
+        rows, columns = self.mask.shape
         inside = low_x >= self.low_x and low_y >= self.low_y and high_x <= self.low_x + rows and high_y <= self.low_y + columns
         return inside and near_m is self.near_m
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """The unseen cells of a window of the map at one moment. Every tube of a tick asks here, so sums are made once.
+
+    `counts`: per kernel, what the hull would touch with its centre in each cell.
+    """
+
+    known: Known
+    hidden: Booleans
+    counts: dict[bool, Counts] = field(default_factory=dict)
 
     def sparing(self, places_m: Floats, boxes: Integers) -> Patch:
         """The same without the cells of the boxes around places [2, n]."""
         hidden, cells = self.hidden.copy(), cells_of(places_m)
-        _clear(hidden, boxes, cells[0] - self.low_x, cells[1] - self.low_y)
-        return Patch(self.near_m, self.low_x, self.low_y, hidden)
+        _clear(hidden, boxes, cells[0] - self.known.low_x, cells[1] - self.known.low_y)
+        return Patch(self.known, hidden)
 
     def part(self, low_x: int, low_y: int, high_x: int, high_y: int) -> Booleans:
         """The unseen cells of a smaller window."""
-        return self.hidden[low_x - self.low_x : high_x - self.low_x, low_y - self.low_y : high_y - self.low_y]
+        x, y = self.known.low_x, self.known.low_y
+        return self.hidden[low_x - x : high_x - x, low_y - y : high_y - y]
 
-    def counted(self, cells: Integers, boxes: Integers, rim: int, wide: bool) -> Integers:
+    def counted(self, cells: Integers, boxes: Integers, rim: int, wide: bool) -> Counts:
         """The weighted sums of a kernel's boxes at cells [2, ...]."""
         if wide not in self.counts:
             self.counts[wide] = _box_counts(self.hidden, boxes, rim)
-        found: Integers = self.counts[wide][cells[0] - (self.low_x + rim), cells[1] - (self.low_y + rim)]
+        found: Counts = self.counts[wide][cells[0] - (self.known.low_x + rim), cells[1] - (self.known.low_y + rim)]
         return found
 
 
 def surfaces(near_m: Floats, low_x: int, low_y: int, shape: tuple[int, ...]) -> Booleans:
     """Cells of a window, whose first cell is given, that belong to known returns."""
     border = SURFACE_CELLS + 1  # what is further out than the border lands in its outermost cells, and those are left off
-    mask = np.zeros((shape[0] + 2 * border, shape[1] + 2 * border), dtype=np.bool_)
-    cells = cells_of(near_m)
-    ix = np.minimum(np.maximum(cells[0] - (low_x - border), 0), mask.shape[0] - 1)
-    iy = np.minimum(np.maximum(cells[1] - (low_y - border), 0), mask.shape[1] - 1)
-    mask[ix, iy] = True
+    rows, columns = shape[0] + 2 * border, shape[1] + 2 * border
+    at = cells_of(near_m) - np.array(((low_x - border,), (low_y - border,)))
+    at = np.minimum(np.maximum(at, 0), np.array(((rows - 1,), (columns - 1,))))
+    mask = np.zeros((rows, columns), dtype=np.bool_)
+    mask.reshape(-1)[at[0] * columns + at[1]] = True
     return _widened(_widened(mask[1:-1, 1:-1]).T).T
 
 
@@ -81,7 +91,7 @@ def cells_of(places_m: Floats) -> Integers:
 def window_around(cells: Integers, rim: int) -> Window:
     """All that the hull could touch with its centre in cells [2, ...]."""
     flat = cells.reshape(2, -1)
-    (low_x, low_y), (high_x, high_y) = flat.min(axis=1).tolist(), flat.max(axis=1).tolist()
+    (low_x, low_y), (high_x, high_y) = np.minimum.reduce(flat, axis=1).tolist(), np.maximum.reduce(flat, axis=1).tolist()
     return low_x - rim, low_y - rim, high_x + rim + 1, high_y + rim + 1
 
 
@@ -93,6 +103,13 @@ def boxes_within(radius_m: float) -> Integers:
     return np.array(corners)
 
 
+def cells_in(boxes: Integers, rim: int) -> Booleans:
+    """Which cells of a square, up to `rim` from the middle one, lie in any of the boxes around it."""
+    middle = np.ones((2 * rim + 1, 2 * rim + 1), dtype=np.bool_)
+    _clear(middle, boxes, np.array([rim]), np.array([rim]))
+    return ~middle
+
+
 def _clear(hidden: Booleans, boxes: Integers, i: Integers, j: Integers) -> None:
     """Take the cells of the boxes around middle cells i, j [n], which may lie outside the window, out of the hidden ones."""
     for row, column in set(zip(i.tolist(), j.tolist(), strict=True)):
@@ -100,12 +117,12 @@ def _clear(hidden: Booleans, boxes: Integers, i: Integers, j: Integers) -> None:
             hidden[max(row - a, 0) : max(row + a + 1, 0), max(column - b, 0) : max(column + b + 1, 0)] = False
 
 
-def _box_counts(hidden: Booleans, boxes: Integers, rim: int) -> Integers:
+def _box_counts(hidden: Booleans, boxes: Integers, rim: int) -> Counts:
     """Sum over the boxes of the hidden cells inside, for each middle cell at least `rim` from the border."""
-    total = np.zeros((hidden.shape[0] + 1, hidden.shape[1] + 1), dtype=np.intp)
-    hidden.cumsum(axis=0, dtype=np.intp).cumsum(axis=1, out=total[1:, 1:])
+    total = np.zeros((hidden.shape[0] + 1, hidden.shape[1] + 1), dtype=np.int32)
+    hidden.cumsum(axis=0, dtype=np.int32).cumsum(axis=1, out=total[1:, 1:])
     rows, columns = hidden.shape[0] - 2 * rim, hidden.shape[1] - 2 * rim
-    counts = np.zeros((rows, columns), dtype=np.intp)
+    counts = np.zeros((rows, columns), dtype=np.int32)
     for a, b in boxes.tolist():
         top, bottom = slice(rim - a, rim - a + rows), slice(rim + a + 1, rim + a + 1 + rows)
         left, right = slice(rim - b, rim - b + columns), slice(rim + b + 1, rim + b + 1 + columns)

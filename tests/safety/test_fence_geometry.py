@@ -133,7 +133,7 @@ def test_rooms_are_those_of_the_slow_way(seed):
 
 @pytest.mark.parametrize("seed", range(60))
 def test_room_now_counts_edges_vertices_floor_and_ceiling(seed):
-    start, _, reach = scene(seed)
+    start, _, _ = scene(seed)
     x, y, z = start.position_m[0]
     worst = min(margin((x, y), k) for k in range(3))
     all_pieces = [piece for ring in rings() for piece in pieces(ring)]
@@ -143,9 +143,7 @@ def test_room_now_counts_edges_vertices_floor_and_ceiling(seed):
     sideways = min(edges, corners) if worst >= 0.0 else worst - least
     assert FENCE.room_m(np.array((x, y))) == pytest.approx(sideways, abs=1e-9)
     assert FENCE.signed_margin_m(np.array((x, y))) == pytest.approx(worst, abs=1e-9)
-    assert GUARD.look(CorridorVector(x, y, z), start, reach).room_m == pytest.approx(
-        min(sideways, z - LOW_M, HIGH_M - z), abs=1e-9
-    )
+    assert GUARD.here(CorridorVector(x, y, z)).least_m == pytest.approx(min(sideways, z - LOW_M, HIGH_M - z), abs=1e-9)
 
 
 def slow_ways(tube, near):
