@@ -47,7 +47,7 @@ class ObstacleMemory:
         old = self._points[:, : self._count]
         if self._count:
             old = old.take(self._kept(seen, reach_m, config).nonzero()[0], axis=1)
-        new = _new_points(seen, reach_m)[:, :CAPACITY]
+        new = _new_points(seen, reach_m)[:, -CAPACITY:]
         split = min(old.shape[1], CAPACITY - new.shape[1])
         end = split + new.shape[1]
         self._points[:, :split] = old[:, old.shape[1] - split :]
@@ -92,18 +92,18 @@ class ObstacleMemory:
 
 
 def _new_points(seen: SeenScan, reach_m: float) -> Floats:
-    """Rows x, y, spread, time of the returns within reach, then of a place behind each one at an edge: its far side is there."""
+    """Rows x, y, spread, time of a place behind each return within reach at an edge, its far side, then of all those returns."""
     dx, dy = seen.x_m - seen.origin_x_m, seen.y_m - seen.origin_y_m
     distance = np.sqrt(dx * dx + dy * dy)
     near = distance < reach_m
     plain, edge = near.nonzero()[0], (near & _edges(seen.range_m)).nonzero()[0]
-    which = np.concatenate((plain, edge))
+    which = np.concatenate((edge, plain))
     rows = np.empty((4, which.shape[0]))
     rows[0], rows[1], rows[2], rows[3] = seen.x_m.take(which), seen.y_m.take(which), seen.spread_m.take(which), seen.time_s
     if edge.shape[0]:
         depth = LEAST_DEPTH_M / np.maximum(distance.take(edge), LEAST_DEPTH_M)
-        rows[0, plain.shape[0] :] += depth * dx.take(edge)
-        rows[1, plain.shape[0] :] += depth * dy.take(edge)
+        rows[0, : edge.shape[0]] += depth * dx.take(edge)
+        rows[1, : edge.shape[0]] += depth * dy.take(edge)
     return rows
 
 
