@@ -104,7 +104,7 @@ class SafetyConfig(_Frozen):
 
     vehicle_radius_m: Positive = Field(0.35, description="A5: the vehicle fits into this horizontal circle")
     vehicle_half_height_m: Positive = Field(0.1, description="the vehicle reaches this far above and below its position")
-    margin_m: NotNegative = Field(0.04, description="distance kept beyond everything that is accounted for")
+    margin_m: NotNegative = Field(0.05, description="distance kept beyond everything that is accounted for")
 
     tick_s: Positive = Field(0.05, description="A3: time between two calls")
     dead_time_s: NotNegative = Field(0.2, description="A3: from sending a command until the vehicle begins to follow it")

@@ -7,8 +7,6 @@ field of view, or is hidden behind something nearer, stays. Returns at an edge a
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +18,6 @@ CAPACITY = 2048
 MOVED_S = (
     1.0  # so long a point spreads at the obstacles' speed; after that the unseen that grows into the map of free space holds
 )
-ALONG_BOTH_AXES = math.sqrt(2.0)  # bounds of errors are per axis
 LEAST_DEPTH_M = 0.1  # nothing is taken to be thinner: a pole seen from one side can be drifted upon from the other
 NOTHING_M = 1e6  # in place of the distance where a beam met nothing
 SAME_PLACE_M = 0.2  # a return this close to a remembered one, along its beam, is the same thing seen again
@@ -85,7 +82,8 @@ class ObstacleMemory:
         """Coordinates x, y [k] and the extra radius [k] each point has by beam width, age, drift and own motion, m."""
         x, y, spread, time_s = self._points[:, : self._count]
         age = np.maximum(now_s - time_s, 0.0)
-        drift = ALONG_BOTH_AXES * np.minimum(age * config.velocity_error_m_s, 2.0 * config.position_error_m)
+        # the estimate may have erred the other way when the point was seen
+        drift = np.minimum(age * config.velocity_error_m_s, 2.0 * config.position_error_m)
         if config.obstacle_speed_m_s == 0.0:
             return x, y, spread + drift
         return x, y, spread + drift + np.minimum(age, MOVED_S) * config.obstacle_speed_m_s

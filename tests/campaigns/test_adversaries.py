@@ -184,6 +184,12 @@ def test_drift_over_the_fence_beside_an_obstacle_is_led_back():
     assert outcome.fence_m > 0.03
 
 
+@pytest.mark.parametrize("case", ["main/poles/vertical/4", "main/gaps/flipped/5", "main/pillars/bang/6"])
+def test_what_was_passed_is_not_drifted_upon(case):
+    """Seen with one error of the estimate, met with the opposite one, from the side that was never seen."""
+    assert not run_case(Case.parse(case)).outcome.events
+
+
 def test_the_way_out_of_a_margin_grows_no_faster_than_the_limits():
     assert not run_case(Case.parse("main/poles/diagonal/0")).outcome.events
 

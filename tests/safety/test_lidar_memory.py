@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from safety_plant import config, scan, state
 
 from safety.lidar import BeamTable, clean_ranges, scan_problem, see
-from safety.memory import CAPACITY, ObstacleMemory
+from safety.memory import CAPACITY, LEAST_DEPTH_M, SAME_PLACE_M, ObstacleMemory, _edges
 from safety.messages import LidarScan
 
 C = config()
@@ -115,25 +115,47 @@ def test_tilt_shortens_the_horizontal_distance():
     assert found.x_m[0] - 5.0 == pytest.approx(2.0 * math.cos(0.3), abs=1e-3)
 
 
+WITH_FAR_SIDE = 2  # points that a single return leaves
+
+
 def fed(memory, ranges, time_s, pose=None):
     memory.update(seen(ranges, pose, time_s), 5.0, C)
     return memory.points(time_s, C)
+
+
+def test_the_far_side_of_an_edge_is_kept_along_its_beam():
+    """A wall 2 m ahead that ends on the left, where a box begins 1 m behind it: a far side of the wall's end alone."""
+    ranges = np.full(180, 2.0)
+    ranges[120:] = 3.0
+    found, memory = seen(ranges), ObstacleMemory()
+    x, y, _ = fed(memory, ranges, 0.0)
+    assert x.shape[0] == 180 + 1
+    behind = np.hypot(x[0] - 5.0, y[0]), math.atan2(y[0], x[0] - 5.0)
+    assert behind == pytest.approx((2.0 + LEAST_DEPTH_M, math.atan2(found.y_m[119], found.x_m[119] - 5.0)))
+
+
+@given(st.lists(st.sampled_from([1.0, 1.1, 1.5, 3.0, math.inf, math.nan]), min_size=2, max_size=12))
+def test_a_return_is_at_an_edge_when_a_beam_beside_it_saw_clearly_further(values):
+    def further(i, j):
+        return 0 <= j < len(values) and values[j] - values[i] > SAME_PLACE_M
+
+    wanted = [further(i, i - 1) or further(i, i + 1) for i, value in enumerate(values) if math.isfinite(value)]
+    assert _edges(np.array(values)).tolist() == wanted
 
 
 def test_new_return_replaces_the_old_one():
     memory = ObstacleMemory()
     for k, range_m in enumerate((2.0, 1.95, 1.9)):
         x, _, _ = fed(memory, one_return(90, range_m), 0.05 * k)
-    assert x.shape == (1,)
-    assert x[0] == pytest.approx(6.9, abs=0.01)
+    assert x == pytest.approx([7.0, 6.9], abs=0.01)
 
 
 def test_drop_out_is_bridged_but_a_gone_obstacle_is_forgotten():
     """L13, L14: one scan that looks past a return does not remove it; three do."""
     memory = ObstacleMemory()
     fed(memory, one_return(90, 2.0), 0.0)
-    assert fed(memory, None, 0.05)[0].shape == (1,)
-    assert fed(memory, None, 0.10)[0].shape == (1,)
+    assert fed(memory, None, 0.05)[0].shape == (WITH_FAR_SIDE,)
+    assert fed(memory, None, 0.10)[0].shape == (WITH_FAR_SIDE,)
     assert fed(memory, None, 0.15)[0].shape == (0,)
 
 
@@ -141,8 +163,8 @@ def test_what_leaves_the_view_is_remembered_for_its_time():
     memory = ObstacleMemory()
     fed(memory, one_return(90, 2.0), 0.0)
     away = state(yaw=math.pi)
-    assert fed(memory, None, 1.0, away)[0].shape == (1,)
-    assert fed(memory, None, C.memory_s - 0.1, away)[0].shape == (1,)
+    assert fed(memory, None, 1.0, away)[0].shape == (WITH_FAR_SIDE,)
+    assert fed(memory, None, C.memory_s - 0.1, away)[0].shape == (WITH_FAR_SIDE,)
     assert fed(memory, None, C.memory_s + 0.1, away)[0].shape == (0,)
 
 
@@ -150,13 +172,13 @@ def test_hidden_behind_something_nearer_stays():
     memory = ObstacleMemory()
     fed(memory, one_return(90, 3.0), 0.0)
     x, _, _ = fed(memory, one_return(90, 1.0), 1.0)
-    assert sorted(np.round(x - 5.0, 1)) == [1.0, 3.0]
+    assert sorted(np.round(x - 5.0, 1)) == [1.0, 1.1, 3.0, 3.1]
 
 
 def test_unknown_beam_forgets_nothing():
     memory = ObstacleMemory()
     fed(memory, one_return(90, 2.0), 0.0)
-    assert fed(memory, one_return(90, np.nan), 1.0)[0].shape == (1,)
+    assert fed(memory, one_return(90, np.nan), 1.0)[0].shape == (WITH_FAR_SIDE,)
 
 
 def test_far_points_are_dropped():
@@ -172,8 +194,23 @@ def test_age_widens_a_point_up_to_its_bounds():
     spread = 2.0 * 0.5 * math.pi / 180
     assert memory.points(0.0, C)[2][0] == pytest.approx(spread)
     assert memory.points(0.5, C)[2][0] == pytest.approx(spread + 0.5 * C.velocity_error_m_s)
-    assert memory.points(10.0, C)[2][0] == pytest.approx(spread + 2.0 * math.sqrt(2.0) * C.position_error_m)
+    assert memory.points(10.0, C)[2][0] == pytest.approx(spread + 2.0 * C.position_error_m)
     assert memory.points(1.0, config(obstacle_speed_m_s=0.5))[2][0] == pytest.approx(spread + 0.05 + 0.5)
+
+
+@given(st.tuples(*[st.floats(-1.0, 1.0)] * 4), st.floats(0.0, 20.0))
+def test_a_point_covers_where_it_seems_to_be_now_whatever_the_estimate_errs_then_and_now(signs, age):
+    """Position errors stay inside their bound on each axis and change no faster than velocity errors let them.
+
+    Along both axes at once they may add up to a little more, which the margin is for.
+    """
+    then, now = np.array(signs[:2]) * C.position_error_m, np.array(signs[2:]) * C.position_error_m
+    now = then + np.clip(now - then, -age * C.velocity_error_m_s, age * C.velocity_error_m_s)
+    memory = ObstacleMemory()
+    fed(memory, one_return(90, 2.0), 0.0, state(x=5.0 + then[0], y=then[1]))
+    x, y, extra = memory.points(age, C)
+    truth = seen(one_return(90, 2.0), state(x=5.0, y=0.0))
+    assert math.hypot(x[-1] - (truth.x_m[0] + now[0]), y[-1] - (truth.y_m[0] + now[1])) <= extra[-1] + 1.05 * C.margin_m
 
 
 @given(st.integers(0, 2**32 - 1))
