@@ -53,7 +53,7 @@ def test_defaults_are_the_reviewed_numbers():
         "max_yaw_rate_rad_s": 1.0,
         "vehicle_radius_m": 0.35,
         "vehicle_half_height_m": 0.1,
-        "margin_m": 0.04,
+        "margin_m": 0.05,
         "tick_s": 0.05,
         "dead_time_s": 0.2,
         "lag_s": 0.6,

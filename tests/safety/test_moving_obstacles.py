@@ -112,17 +112,19 @@ def test_the_vehicle_never_runs_into_crossing_movers(speed, seed):
     noise = EstimateNoise(position_m=(0.0167,) * 3, velocity_m_s=(0.0167,) * 3, attitude_rad=(0.005,) * 3)
     sim = Simulation(crossing(speed, seed), estimate=noise, seed=seed, hover_height_m=2.0)
     safety = SafetyFilter(SafetyConfig(fence=FENCE, obstacle_speed_m_s=speed))
-    worst = -math.inf
+    worst, run_over = -math.inf, False  # a mover may pass through the standing vehicle: then its LiDAR sees nothing but that
     for k in range(600):
         now = sim.time_s
         sent, verdict = safety.apply(command(1.0), state_of(sim.estimate()), scan_of(sim.scan()), now)
-        assert verdict.fault is None
+        assert verdict.fault is None or (verdict.fault == "scan_touching" and run_over)
+        run_over = False
         sim.advance(step_at((k + 1) * 0.05) - sim.steps, (sent.velocity.x, sent.velocity.y, sent.velocity.z), sent.yaw_rate_rad_s)
         x, y, _ = sim.truth.position_m
         for b in sim.boxes():
             flat = (b[0], b[1], b[3], b[4])
             if gap_m(np.array([flat]), x, y) <= 0.0:
                 worst = max(worst, float(np.array(sim.truth.velocity_m_s[:2]) @ towards_box(flat, x, y)))
+                run_over = True
     assert worst <= SLOW_M_S
     assert sim.truth.position_m[0] > 6.0
 
