@@ -228,7 +228,7 @@ def main() -> None:
     except Exception as error:
         if not hasattr(error, "format_message"):  # typer's usage errors have no public base class
             raise
-        print(f"lidar-view: {error.format_message()} See lidar-view --help.", file=sys.stderr)
+        print(f"lidar-view: {error.format_message().rstrip('.')}; see lidar-view --help", file=sys.stderr)
         code = 2
     sys.exit(int(code or 0))
 
