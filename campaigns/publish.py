@@ -8,12 +8,12 @@ Reads the policy files and `results/*.json`; no figure is ever typed in. Run it 
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 from campaigns.adversaries.report import section
 from campaigns.clients.report import markdown as client_tables
+from campaigns.command_line import run_command
 from campaigns.faults.report import markdown as fault_table
 from campaigns.price import markdown as price_table
 from campaigns.process_death import markdown
@@ -197,7 +197,4 @@ def _write_block(path: Path, begin: str, end: str, block: str) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        publish()
-    except (PolicyError, OSError, ValueError) as error:
-        sys.exit(f"publish: {error}")
+    run_command("publish", publish, PolicyError, ValueError)

@@ -13,7 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from campaigns.errors import USER_ERRORS
+from campaigns.command_line import positive, run_command
 from campaigns.paper.figures import draw_bars, draw_curves, draw_flights
 from campaigns.paper.measures import flown_measures, read_curves, training_measures, write_json
 from campaigns.paper.report import article, make_table, markdown
@@ -74,18 +74,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--runs", type=Path, default=Path("runs/paper"), help="folder of the training runs")
     parser.add_argument("--ppo", type=Path, default=Path("configs/training/paper_ppo.yaml"), help="preset without memory")
     parser.add_argument("--lstm", type=Path, default=Path("configs/training/paper_ppo_lstm.yaml"), help="preset with memory")
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", type=positive, default=5)
     parser.add_argument("--decisions", type=float, help="replaces the presets' training volume")
-    parser.add_argument("--episodes", type=int, default=100, help="flights per policy and split")
-    parser.add_argument("--workers", type=int, help="processes; default: all cores")
+    parser.add_argument("--episodes", type=positive, default=100, help="flights per policy and split")
+    parser.add_argument("--workers", type=positive, help="processes; default: all cores")
     parser.add_argument("--mission", type=Path, default=Path("configs/corridor.yaml"))
     parser.add_argument("--splits", type=Path, default=Path("configs/evaluation.yaml"))
     return parser
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (*USER_ERRORS, CheckpointError) as mistake:
-        print(f"paper: {mistake}", file=sys.stderr)
-        sys.exit(2)
+    run_command("paper", main, CheckpointError)
