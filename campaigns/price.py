@@ -72,7 +72,9 @@ def markdown(report: dict[str, Any]) -> str:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(prog="python -m campaigns.price", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m campaigns.price", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--policy", type=Path, default=Path("policies/corridor_ppo_lstm.onnx"))
     parser.add_argument("--split", default="unseen")
     parser.add_argument("--episodes", type=positive, default=200)

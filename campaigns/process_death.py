@@ -197,7 +197,9 @@ def _milliseconds(value: float | None) -> str:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(prog="python -m campaigns.process_death", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m campaigns.process_death", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--repeats", type=positive, default=3, help="runs of every cell")
     parser.add_argument("--pauses", type=positive, default=20, help="runs of the cells with SIGSTOP and SIGCONT of fly")
     parser.add_argument("--only", default="", help="only cells whose name holds this, e.g. 'guard SIGKILL'")
@@ -206,6 +208,8 @@ def main() -> int:
     arguments = parser.parse_args()
     prepare_output(arguments.out)
     cells = [cell for cell in CELLS if arguments.only in f"{cell.process} {cell.name}"]
+    if not cells:
+        raise ValueError(f"no cell holds {arguments.only!r}; there are: {', '.join(f'{c.process} {c.name}' for c in CELLS)}")
     order = [cell for cell in cells for _ in range(arguments.pauses if _is_pause(cell) else arguments.repeats)]
     result = fly_all(order, arguments.out, arguments.jobs)
     print(markdown(result))
@@ -248,4 +252,4 @@ def fly_or_say_why(cell: Cell, seed: int, phase_s: float) -> Run | str:
 
 
 if __name__ == "__main__":
-    run_command("process_death", main)
+    run_command("process_death", main, ValueError)

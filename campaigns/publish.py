@@ -7,6 +7,7 @@ Reads the policy files and `results/*.json`; no figure is ever typed in. Run it 
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -138,6 +139,14 @@ layer.
 """
 
 
+def main() -> None:
+    """Command line; it has no options."""
+    argparse.ArgumentParser(
+        prog="python -m campaigns.publish", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
+    publish()
+
+
 def publish() -> None:
     """Write the cards and the tables."""
     results = read_results()
@@ -197,4 +206,4 @@ def _write_block(path: Path, begin: str, end: str, block: str) -> None:
 
 
 if __name__ == "__main__":
-    run_command("publish", publish, PolicyError, ValueError)
+    run_command("publish", main, PolicyError, ValueError)

@@ -126,7 +126,9 @@ def summarise(mission: Path, flights: list[RealFlight]) -> dict[str, Any]:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(prog="python -m campaigns.realtime", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m campaigns.realtime", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--mission", type=Path, default=Path("configs/corridor.yaml"))
     parser.add_argument("--flights", type=positive, default=20)
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED, help="seeds from 2000000 up were never trained on")
@@ -134,6 +136,7 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="keep every run folder below this one")
     arguments = parser.parse_args()
     prepare_output(arguments.out)
+    load_mission(arguments.mission)
     flights: list[RealFlight] = []
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(arguments.first_seed, arguments.first_seed + arguments.flights):

@@ -91,7 +91,9 @@ def chosen(arguments: argparse.Namespace) -> dict[str, Callable[[int, int, Path]
 
 def main() -> int:
     """Command line; exit code 1 when a client saw something that a vehicle would not show it."""
-    parser = argparse.ArgumentParser(prog="python -m campaigns.clients", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m campaigns.clients", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--mavsdk-grpc-python", action="append", default=[], help="a Python that has mavsdk-grpc; repeatable")
     parser.add_argument("--mavproxy", type=Path, help="mavproxy.py of an environment that has MAVProxy")
     parser.add_argument("--out", type=Path, required=True, help="result (JSON)")

@@ -55,6 +55,8 @@ def show(mutant: Mutant, verdict: Verdict) -> None:
 def main() -> int:
     """Run what has no verdict yet; 0 when every mutant is killed or proved equivalent."""
     chosen, root, begin = options(), Path.cwd(), time.monotonic()
+    if unknown := set(chosen.module or ()) - set(sources(root)):
+        raise ValueError(f"no such file of safety/: {', '.join(sorted(unknown))}; write it as safety/limits.py")
     if chosen.out:
         prepare_output(chosen.out)
     chosen.work.mkdir(parents=True, exist_ok=True)
@@ -90,4 +92,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    run_command("mutation", main, BaselineError)
+    run_command("mutation", main, BaselineError, ValueError)
