@@ -205,7 +205,9 @@ def _source(mission: Path | None, given: dict[str, Any], changes: list[str]) -> 
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "lidar"
-        raise _UsageError(f"{where}: {first['msg']}") from None
+        unknown = first["type"] == "extra_forbidden"
+        what = "unknown key; see docs/lidar.md" if unknown else first["msg"].removeprefix("Value error, ")
+        raise _UsageError(f"{where}: {what}") from None
 
 
 def _value(text: str) -> Any:
