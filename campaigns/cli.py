@@ -102,7 +102,7 @@ def main() -> None:
     """Entry point: a user's mistake is one line on stderr and exit code 2."""
     from campaigns.command_line import run_command
 
-    run_command("evaluate-policy", app)
+    run_command("evaluate-policy", lambda: app(standalone_mode=False))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
+import typer
+
 from campaigns.errors import USER_ERRORS, OutputError
 
 STOPPED = 130  # 128 and SIGINT, as shells have it
@@ -19,16 +21,21 @@ def run_command(name: str, main: Callable[[], int | None], *mistakes: type[Excep
 
     `mistakes`: exceptions of this command that are the user's, beside those of all.
     """
+    the_users: tuple[type[Exception], ...] = (*USER_ERRORS, *mistakes)
     try:
         sys.exit(main())
-    except (*USER_ERRORS, *mistakes) as mistake:
+    except the_users as mistake:
         _end(f"{name}: {mistake}", 2)
     except OSError as error:
         if error.filename is None:  # not about a file that somebody named
             raise
         _end(f"{name}: {error.filename}: {error.strerror}", 2)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):
         _end(f"{name}: stopped", STOPPED)
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # typer's usage errors have no public base class
+            raise
+        _end(f"{name}: {error.format_message().rstrip('.')}; see {name} --help", 2)
 
 
 def _end(line: str, code: int) -> NoReturn:

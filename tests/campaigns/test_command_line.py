@@ -77,6 +77,7 @@ def test_counts_are_positive(text: str) -> None:
         ["campaigns.adversaries", "--out", "results/a.png"],
         ["campaigns.cli", "policies/corridor_ppo_lstm.onnx", "--out", "runs/tables.md"],
         ["campaigns.cli", "no-such-file.onnx"],
+        ["campaigns.cli", "--episodes", "0"],
     ],
     ids=" ".join,
 )
