@@ -174,4 +174,4 @@ def _advance(
         if _first_not_finite(state) >= 0:
             return first_step + step + 1
         after_step(state, x, y, z, first_step + step, boxes, fixed, movers, radius, log)
-    return first_step + normals.shape[0]
+    return first_step + len(normals)

@@ -165,7 +165,7 @@ def _prepare(
     lift_n = (loads[0] + loads[1] + loads[2] + loads[3]) * _POUND_N
     if state[LANDED] > 0.0 and lift_n > params[vp.MASS] * GRAVITY_M_S2:
         state[LANDED] = 0.0
-    return state[LANDED] == 0.0
+    return bool(state[LANDED] == 0.0)
 
 
 @njit(cache=True)

@@ -103,7 +103,7 @@ def _advance(
             _substep(state, params, motors, contacts, commands, wind, turn, force, inertial)
         inertial /= _SUBSTEPS
         after_step(state, x, y, z, first_step + step, boxes, fixed, movers, radius, log)
-    return first_step + normals.shape[0]
+    return first_step + len(normals)
 
 
 @njit(cache=True, error_model="numpy")
