@@ -135,8 +135,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/realtime.json"))
     parser.add_argument("--keep", type=Path, help="keep every run folder below this one")
     arguments = parser.parse_args()
-    prepare_output(arguments.out)
     load_mission(arguments.mission)
+    prepare_output(arguments.out)
     flights: list[RealFlight] = []
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(arguments.first_seed, arguments.first_seed + arguments.flights):

@@ -183,6 +183,7 @@ def serve(
     _refuse("goes only with --px4", {"--no-gps": no_gps and not simulator, "--speed 0": speed == 0.0 and not simulator})
     _refuse("goes only with --follow", {"--origin": origin is not None and not follower})
     _refuse("goes only with --serial-lidar", {"--serial-link": serial_link is not None and serial_lidar is None})
+    _refuse("is the onboard client's port: give another, or 0 for none", {"--gcs-port": gcs_port == onboard_port})
     _refuse("is another role than --follow: choose one", {"--px4": simulator and follower})
     if simulator or follower:
         _refuse("goes with neither --px4 nor --follow", {"--vehicles": vehicles > 1, "--link": bool(link)})

@@ -36,8 +36,8 @@ def main(arguments: list[str] | None = None) -> int:
     algorithms = {name: load_config(path, TrainingConfig) for name, path in presets.items()}
     decisions = None if chosen.decisions is None else int(chosen.decisions)
     runs = study_runs(algorithms, chosen.seeds, decisions, chosen.runs)
-    prepare_output(chosen.out / TABLE)
     splits, safety = load_splits(list(SPLITS), chosen.splits), load_mission(chosen.mission).safety
+    prepare_output(chosen.out / TABLE)
     train_all(runs, chosen.workers)
     write_study(runs, chosen, splits, safety)
     return 0

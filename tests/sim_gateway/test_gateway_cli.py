@@ -262,6 +262,7 @@ def test_port_in_use_is_one_line_and_exit_2(world: Path, which: str) -> None:
         (["--follow", "udpin://127.0.0.1:14551", "--px4"], "choose one"),
         (["--follow", "udpin://127.0.0.1:14551", "--vehicles", "2"], "--vehicles"),
         (["--px4", "--link", "udp:14540,delay_ms=5"], "--link"),
+        (["--onboard-port", "14550"], "--gcs-port"),
         (["--report", "/"], "--report"),
         (["--report", "/dev/null/truth.json"], "--report"),
     ],
