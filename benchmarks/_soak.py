@@ -63,6 +63,11 @@ def resident_mib() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
+def held() -> int:
+    """File descriptors and threads of this process now."""
+    return len(os.listdir("/proc/self/fd")) + len(os.listdir("/proc/self/task"))
+
+
 def peak_mib() -> float:
     """Largest resident memory of this process so far."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
@@ -84,12 +89,13 @@ def main() -> None:
     gc.disable()
     clock = _Clock()
     with _recorder(folder, runner, policy, clock) if record else nullcontext() as recorder:
-        resident = _fly(pilot, log, recorder, clock, inputs, ticks)
+        resident, gained = _fly(pilot, log, recorder, clock, inputs, ticks)
     gc.enable()
     _write_results(log, runner, folder)
     report = {
         "resident_mib": resident,
         "peak_mib": peak_mib(),
+        "gained": gained,
         "minutes": len(log) * TICK_S / 60.0,
         "recorded": recorder.recorded / ticks if recorder is not None else 1.0,
         "flown": sum(record.wanted is not None for record in log.records) / ticks,
@@ -127,9 +133,14 @@ def _recorder(folder: Path, runner: PolicyRunner, policy: Path, clock: _Clock) -
     return Recorder(folder / "flight.mcap", _header(runner, policy), policy.read_bytes(), RecordingConfig(), clock=clock)
 
 
-def _fly(pilot: Pilot, log: FlightLog, recorder: Recorder | None, clock: _Clock, inputs: Path, ticks: int) -> list[float]:
-    """All ticks, no faster than the recorder writes them; gives the resident memory at every twelfth of the time."""
-    resident = []
+def _fly(
+    pilot: Pilot, log: FlightLog, recorder: Recorder | None, clock: _Clock, inputs: Path, ticks: int
+) -> tuple[list[float], int]:
+    """All ticks, no faster than the recorder writes them.
+
+    Gives the resident memory at every twelfth of the time, and the descriptors and threads gained since the first of them.
+    """
+    resident, counts = [], []
     for k, (scan, state, now_s) in enumerate(samples(inputs, ticks)):
         record = pilot.tick(scan, state, now_s)
         log.append(record, now_s + 0.001, 0.0001)
@@ -139,8 +150,9 @@ def _fly(pilot: Pilot, log: FlightLog, recorder: Recorder | None, clock: _Clock,
             clock.now_s = now_s
         if (k + 1) % (ticks // 12) == 0:
             resident.append(resident_mib())
+            counts.append(held())
             print(f"   {(k + 1) * TICK_S / 60.0:4.0f} min: {resident[-1]:.2f} MiB", file=sys.stderr, flush=True)
-    return resident
+    return resident, counts[-1] - counts[0]
 
 
 def _record(recorder: Recorder, k: int, record: TickRecord, scan: LidarScan, state: VehicleState) -> None:

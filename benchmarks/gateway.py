@@ -52,7 +52,7 @@ def speed_figures() -> list[Figure]:
     taken: dict[str, list[float]] = {name: [] for name in vehicles}
     for _ in range(ROUNDS):
         for name, vehicle in vehicles.items():
-            seconds = _processor_s(lambda v=vehicle: fly([v], v.advance, SPEED_SPAN_S, v.simulation.scan))  # type: ignore[misc]
+            seconds = _processor_s(lambda v=vehicle: fly([v], v.advance, SPEED_SPAN_S, v.simulation.scan))
             taken[name].append(SPEED_SPAN_S / seconds)
     middle = {name: sorted(factors)[ROUNDS // 2] for name, factors in taken.items()}
     return [

@@ -1,4 +1,5 @@
-"""Memory of the flight stack over a simulated hour: 72,000 ticks of policy, safety filter, log and recording in one process.
+"""Memory of the flight stack over a simulated hour, and its file descriptors and threads: 72,000 ticks of policy, safety filter,
+log and recording in one process.
 
 The process imports what `fly` imports and is fed with scans and states that another process has written, so it holds no
 simulator. Its memory is read every five simulated minutes, with the garbage collector off as in flight, once without and once
@@ -52,6 +53,7 @@ def _figures(name: str, seen: dict[str, Any], minutes: float) -> list[Figure]:
         ("resident at the end", resident[-1], "MiB", LIMIT_MIB, resident[-1] <= LIMIT_MIB),
         ("largest, results written", peak, "MiB", LIMIT_MIB, peak <= LIMIT_MIB),
         ("slope after a sixth of the time", growth, "MiB/h", allowed, growth <= allowed),
+        ("descriptors and threads gained", float(seen["gained"]), "", 0.0, seen["gained"] <= 0),
         ("simulated time", seen["minutes"], "min", minutes, seen["minutes"] >= minutes),
         ("ticks that the policy flew", 100.0 * seen["flown"], "%", 95.0, seen["flown"] >= 0.95),
         ("ticks taken by the recorder", 100.0 * seen["recorded"], "%", 99.9, seen["recorded"] >= 0.999),

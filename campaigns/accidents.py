@@ -23,13 +23,14 @@ for _name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 from pydantic import BaseModel, ConfigDict
 
+from campaigns.command_line import positive, prepare_output, run_command
 from campaigns.mutation.forks import Answer, Job, run_forked
 from campaigns.mutation.hotswap import forget, preload, swap
 from campaigns.mutation.mutants import sources
 from campaigns.mutation.probe import fixed_examples, function_of, run_tests
 from campaigns.mutation.suite import SLOW
 from campaigns.mutation.testmap import BaselineError, TestMap
-from strict_yaml import ConfigError, load_config
+from strict_yaml import load_config
 
 FOLDER = Path("tests/safety/accidents")
 LEAST_TESTS = 2  # that must notice each accident
@@ -150,8 +151,8 @@ def options() -> argparse.Namespace:
     )
     parser.add_argument("--missing", action="store_true", help="only what the file at --out does not show as noticed; it is kept")
     parser.add_argument("--again", type=Path, help="an earlier result: run only the tests that noticed each accident then")
-    parser.add_argument("--handful", type=int, help="only so many, every day others")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="accidents at a time")
+    parser.add_argument("--handful", type=positive, help="only so many, every day others")
+    parser.add_argument("--jobs", type=positive, default=os.cpu_count() or 1, help="accidents at a time")
     parser.add_argument("--work", type=Path, default=Path("runs/mutation"), help="folder of the map of the tests")
     return parser.parse_args()
 
@@ -172,6 +173,8 @@ def _noticed(path: Path, ignore: list[str]) -> dict[str, list[str]]:
 def main() -> int:
     """Let accidents happen; 0 when each was noticed by enough tests."""
     chosen, root = options(), Path.cwd()
+    if chosen.out:
+        prepare_output(chosen.out)
     accidents = [one for one in load_accidents() if not chosen.only or any(text in one.name for text in chosen.only)]
     kept = _noticed(chosen.out, chosen.ignore) if chosen.missing and chosen.out else {}
     accidents = [one for one in accidents if one.name not in kept]
@@ -204,7 +207,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (ConfigError, BaselineError, ValueError) as error:
-        sys.exit(f"accidents: {error}")
+    run_command("accidents", main, BaselineError, ValueError)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -61,12 +60,15 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
     """Fly policies through named corridors, whole stack in lockstep: policy file, safety, vehicle, LiDAR."""
+    from campaigns.command_line import prepare_output
     from campaigns.evaluate import TRAINING, Campaign, report, run_campaign
     from campaigns.splits import load_splits
     from flight.mission import load_mission
     from policy_export.runner import PolicyRunner
     from sim_gateway.dynamics import require_dynamics
 
+    if out is not None:
+        prepare_output(out, beside=(".md",))
     if dynamics.value != TRAINING:
         require_dynamics(dynamics.value)
     chosen = load_splits(split or ["unseen"], splits)
@@ -87,7 +89,6 @@ def _write(reports: list[dict[str, Any]], out: Path | None, as_json: bool) -> No
     from campaigns.evaluation_report import markdown
 
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps(reports[0] if len(reports) == 1 else reports, indent=1) + "\n")
         out.with_suffix(".md").write_text(markdown(reports))
     if as_json:
@@ -99,13 +100,9 @@ def _write(reports: list[dict[str, Any]], out: Path | None, as_json: bool) -> No
 
 def main() -> None:
     """Entry point: a user's mistake is one line on stderr and exit code 2."""
-    from campaigns.errors import USER_ERRORS
+    from campaigns.command_line import run_command
 
-    try:
-        app()
-    except USER_ERRORS as error:
-        print(f"evaluate-policy: {error}", file=sys.stderr)
-        sys.exit(2)
+    run_command("evaluate-policy", lambda: app(standalone_mode=False))
 
 
 if __name__ == "__main__":

@@ -12,4 +12,8 @@ class ClusterError(Exception):
     """The Ray cluster cannot be used; the message says why."""
 
 
-USER_ERRORS = (ClusterError, ConfigError, DynamicsError, FlyError, PolicyFileError, PolicyRateError)
+class OutputError(Exception):
+    """A result cannot be written where it should be; the message says what to change."""
+
+
+USER_ERRORS = (ClusterError, ConfigError, DynamicsError, FlyError, OutputError, PolicyFileError, PolicyRateError)

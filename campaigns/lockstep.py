@@ -26,8 +26,9 @@ from sim_gateway.collision import clearance_m
 from sim_gateway.errors import DivergedError
 from sim_gateway.lidar import LidarConfig
 from sim_gateway.paths import shortest_path_length
+from sim_gateway.readings import Motion, Scan
 from sim_gateway.scene import World
-from sim_gateway.simulation import Motion, Scan, Simulation, WindConfig, step_at
+from sim_gateway.simulation import Simulation, WindConfig, step_at
 from sim_gateway.vehicle import STEP_S
 from sim_gateway.vehicle_params import PROFILES
 

@@ -10,11 +10,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
-from campaigns.errors import USER_ERRORS
+from campaigns.command_line import positive, prepare_output, run_command
 from campaigns.evaluate import Campaign, run_campaign
 from campaigns.splits import load_split
 from campaigns.statistics import EpisodeResult, mean, proportion
@@ -73,14 +72,17 @@ def markdown(report: dict[str, Any]) -> str:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(prog="python -m campaigns.price", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m campaigns.price", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--policy", type=Path, default=Path("policies/corridor_ppo_lstm.onnx"))
     parser.add_argument("--split", default="unseen")
-    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--episodes", type=positive, default=200)
     parser.add_argument("--mission", type=Path, default=Path("configs/corridor.yaml"))
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--jobs", type=positive, default=os.cpu_count() or 1)
     parser.add_argument("--out", type=Path, default=Path("results/safety_price.json"))
     chosen = parser.parse_args()
+    prepare_output(chosen.out)
     mission, split = load_mission(chosen.mission), load_split(chosen.split)
     sides = {
         name: figures(
@@ -97,15 +99,10 @@ def main() -> int:
         "price": found,
         **sides,
     }
-    chosen.out.parent.mkdir(parents=True, exist_ok=True)
     chosen.out.write_text(json.dumps(report, indent=1) + "\n")
     print(markdown(report))
     return 0 if acceptable(found) else 1
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except USER_ERRORS as mistake:
-        print(f"price: {mistake}", file=sys.stderr)
-        sys.exit(2)
+    run_command("price", main)

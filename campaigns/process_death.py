@@ -23,8 +23,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from campaigns.command_line import positive, prepare_output, run_command
 from campaigns.death_scene import CELLS, Cell, Scene
-from campaigns.errors import USER_ERRORS
 from campaigns.wire_tap import WireTap
 
 FIRST_SEED = 5_000_000
@@ -197,15 +197,19 @@ def _milliseconds(value: float | None) -> str:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(prog="python -m campaigns.process_death", description=__doc__)
-    parser.add_argument("--repeats", type=int, default=3, help="runs of every cell")
-    parser.add_argument("--pauses", type=int, default=20, help="runs of the cells with SIGSTOP and SIGCONT of fly")
+    parser = argparse.ArgumentParser(
+        prog="python -m campaigns.process_death", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--repeats", type=positive, default=3, help="runs of every cell")
+    parser.add_argument("--pauses", type=positive, default=20, help="runs of the cells with SIGSTOP and SIGCONT of fly")
     parser.add_argument("--only", default="", help="only cells whose name holds this, e.g. 'guard SIGKILL'")
     parser.add_argument("--out", type=Path, default=Path("runs/process_death.json"))
-    parser.add_argument("--jobs", type=int, default=1, help="flights at a time")
+    parser.add_argument("--jobs", type=positive, default=1, help="flights at a time")
     arguments = parser.parse_args()
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    prepare_output(arguments.out)
     cells = [cell for cell in CELLS if arguments.only in f"{cell.process} {cell.name}"]
+    if not cells:
+        raise ValueError(f"no cell holds {arguments.only!r}; there are: {', '.join(f'{c.process} {c.name}' for c in CELLS)}")
     order = [cell for cell in cells for _ in range(arguments.pauses if _is_pause(cell) else arguments.repeats)]
     result = fly_all(order, arguments.out, arguments.jobs)
     print(markdown(result))
@@ -248,8 +252,4 @@ def fly_or_say_why(cell: Cell, seed: int, phase_s: float) -> Run | str:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except USER_ERRORS as mistake:
-        print(f"process_death: {mistake}", file=sys.stderr)
-        sys.exit(2)
+    run_command("process_death", main, ValueError)

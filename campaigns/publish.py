@@ -7,13 +7,14 @@ Reads the policy files and `results/*.json`; no figure is ever typed in. Run it 
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 from campaigns.adversaries.report import section
 from campaigns.clients.report import markdown as client_tables
+from campaigns.command_line import run_command
 from campaigns.faults.report import markdown as fault_table
 from campaigns.price import markdown as price_table
 from campaigns.process_death import markdown
@@ -140,6 +141,14 @@ layer.
 """
 
 
+def main() -> None:
+    """Command line; it has no options."""
+    argparse.ArgumentParser(
+        prog="python -m campaigns.publish", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
+    publish()
+
+
 def publish() -> None:
     """Write the cards and the tables."""
     results = read_results()
@@ -199,7 +208,4 @@ def _write_block(path: Path, begin: str, end: str, block: str) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        publish()
-    except (PolicyError, OSError, ValueError) as error:
-        sys.exit(f"publish: {error}")
+    run_command("publish", main, PolicyError, ValueError)

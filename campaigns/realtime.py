@@ -18,7 +18,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from campaigns.errors import USER_ERRORS
+from campaigns.command_line import positive, prepare_output, run_command
 from campaigns.statistics import mean, proportion
 from flight.mission import load_mission
 from safety.config import SafetyConfig
@@ -126,14 +126,17 @@ def summarise(mission: Path, flights: list[RealFlight]) -> dict[str, Any]:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(prog="python -m campaigns.realtime", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m campaigns.realtime", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--mission", type=Path, default=Path("configs/corridor.yaml"))
-    parser.add_argument("--flights", type=int, default=20)
+    parser.add_argument("--flights", type=positive, default=20)
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED, help="seeds from 2000000 up were never trained on")
     parser.add_argument("--out", type=Path, default=Path("runs/realtime.json"))
     parser.add_argument("--keep", type=Path, help="keep every run folder below this one")
     arguments = parser.parse_args()
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    load_mission(arguments.mission)
+    prepare_output(arguments.out)
     flights: list[RealFlight] = []
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(arguments.first_seed, arguments.first_seed + arguments.flights):
@@ -148,8 +151,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except USER_ERRORS as mistake:
-        print(f"realtime: {mistake}", file=sys.stderr)
-        sys.exit(2)
+    run_command("realtime", main)

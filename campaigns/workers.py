@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
-from typing import TypeVar
+from contextlib import contextmanager
+from multiprocessing import active_children, get_context
+from typing import Any, TypeVar
 
 from campaigns.errors import ClusterError
 
@@ -17,13 +19,32 @@ RAY_CHUNK = 4
 CONNECT_TIMEOUT_S = 5.0
 
 
+@contextmanager
+def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
+    """New processes for the block. A block that ends by an exception or Ctrl-C ends them at once, with all that still waits."""
+    others = set(active_children())
+    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_leave_ctrl_c_to_the_parent)
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in set(active_children()) - others:
+            child.terminate()
+        raise
+    pool.shutdown()
+
+
+def _leave_ctrl_c_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def over_processes(function: Callable[[int], Result], count: int, workers: int | None = None) -> Iterator[tuple[int, Result]]:
     """(index, `function(index)`) of 0..count-1 as they are done, on `workers` new processes; all cores by default."""
     workers = min(workers or os.cpu_count() or 1, count)
     if workers == 1:
         yield from ((i, function(i)) for i in range(count))
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with process_pool(workers) as pool:
         futures = {pool.submit(function, i): i for i in range(count)}
         for future in as_completed(futures):
             yield futures[future], future.result()
@@ -46,7 +67,8 @@ def over_ray(function: Callable[[int], Result], count: int, address: str) -> Ite
         ray.shutdown()
 
 
-def _connect(address: str):  # type: ignore[no-untyped-def]  # the module itself, which may not be installed
+def _connect(address: str) -> Any:
+    """The module itself, which may not be installed, connected."""
     try:
         import ray  # noqa: PLC0415  # an extra
     except ImportError:

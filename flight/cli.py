@@ -160,6 +160,6 @@ def main() -> None:
     except Exception as error:
         if not hasattr(error, "format_message"):  # typer's usage errors have no public base class
             raise
-        print(f"fly: {error.format_message()} See fly --help.", file=sys.stderr)
+        print(f"fly: {error.format_message().rstrip('.')}; see fly --help", file=sys.stderr)
         code = ExitCode.USAGE
     sys.exit(int(code or 0))

@@ -15,11 +15,13 @@ import queue
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from flight.checks.facts import Fields
+from flight.connection import OWN_COMPONENT_ID, OWN_SYSTEM_ID
 from flight.errors import VehicleCommandError
 from flight.fence_outline import grown, shrunk
-from flight.link import OWN_COMPONENT_ID, OWN_SYSTEM_ID, VehicleLink
+from flight.link import VehicleLink
 from flight.preparation import Place
 from safety.config import SafetyConfig
 from safety.fence import Ring
@@ -155,7 +157,7 @@ class FenceClient:
         found = []
         for seq in range(count):
             self._send("MISSION_REQUEST_INT", seq=seq)
-            item = self._await("MISSION_ITEM_INT", lambda seq=seq: self._send("MISSION_REQUEST_INT", seq=seq), seq)  # type: ignore[misc]
+            item = self._await("MISSION_ITEM_INT", partial(self._send, "MISSION_REQUEST_INT", seq=seq), seq)
             found.append(FenceVertex(int(item["command"]), round(float(item["param1"])), (int(item["x"]), int(item["y"]))))
         self._send("MISSION_ACK", type=ACCEPTED)
         return found

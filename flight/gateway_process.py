@@ -147,12 +147,11 @@ def parse_ready_line(line: bytes) -> GatewayReady:
     """The JSON line of a ready gateway. Raises `GatewayError` when a field is missing or not finite."""
     try:
         data = json.loads(line)
-        boxes = tuple(_finite(box, 6) for box in data["boxes"])
         return GatewayReady(
-            start=_finite(data["start"], 3),  # type: ignore[arg-type]
+            start=_point(data["start"]),
             start_yaw_rad=float(_finite([data["start_yaw_rad"]], 1)[0]),
-            goal=_finite(data["goal"], 3),  # type: ignore[arg-type]
-            boxes=boxes,  # type: ignore[arg-type]
+            goal=_point(data["goal"]),
+            boxes=tuple(map(_box, data["boxes"])),
             lidar_port=int(data["lidar_port"]),
             onboard_port=int(data["onboard_port"]),
             details=data,
@@ -161,6 +160,16 @@ def parse_ready_line(line: bytes) -> GatewayReady:
         raise GatewayError(
             f"sim-gateway's ready line cannot be read ({error!r}); are gateway and fly of the same version?"
         ) from None
+
+
+def _point(values: Any) -> tuple[float, float, float]:
+    x, y, z = _finite(values, 3)
+    return x, y, z
+
+
+def _box(values: Any) -> Box:
+    x_min, y_min, z_min, x_max, y_max, z_max = _finite(values, 6)
+    return x_min, y_min, z_min, x_max, y_max, z_max
 
 
 def _finite(values: Any, count: int) -> tuple[float, ...]:

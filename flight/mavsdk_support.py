@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 from flight.errors import RefusedError
 from flight.px4 import RESULT_ACCEPTED, RESULT_NAMES
 
-log = logging.getLogger("flight.link")
+log = logging.getLogger("flight.mavsdk_support")
 
 
 class Answer:

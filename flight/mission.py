@@ -50,6 +50,8 @@ class VehicleSection(_Section):
     def _known(cls, value: str) -> str:
         if value != SIM and not _URL.fullmatch(value):
             raise ValueError("give `sim`, or a MAVSDK URL such as udpin://127.0.0.1:14540 or serial:///dev/ttyAMA0:921600")
+        if not value.startswith((SIM, "serial")) and not 0 < int(value.rpartition(":")[2]) < 65536:
+            raise ValueError("the port must lie in 1..65535")
         return value
 
 

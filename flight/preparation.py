@@ -41,10 +41,12 @@ def lidar_source(mission: Mission) -> LidarSource:
 
 
 def gateway_arguments(mission: Mission) -> list[str]:
-    """Command line of `sim-gateway` for a mission with a `sim` section. Raises `MissionError` without one."""
+    """Command line of `sim-gateway` for a mission. Raises `MissionError` without a `sim` section, or without its world's file."""
     sim = mission.sim
     if sim is None:
         raise MissionError("the mission has no `sim` section: the simulator cannot be started")
+    if not sim.world.is_file():
+        raise MissionError(f"sim.world {sim.world}: no such file")
     arguments = [
         "--world",
         str(sim.world),

@@ -218,6 +218,8 @@ def read_recording(path: Path) -> Recording:
         raise RecordingError(f"cannot read {path}: {error.strerror}") from None
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
+    if builder.header is None and salvage.cut is not None:
+        raise RecordingError(f"{path}: nothing of a flight can be read from it: {salvage.cut}, before its first whole chunk")
     if builder.header is None:
         raise RecordingError(f"{path} is not a recording of fly: it has no message on {HEADER_TOPIC}")
     return Recording(builder.header, builder.policy, builder.ticks, builder.events, salvage)

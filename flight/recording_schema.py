@@ -147,9 +147,9 @@ def decode_scan(text: bytes) -> tuple[int, LidarScan]:
         data = base64.b64decode(document["ranges_f32"], validate=True)
         if len(data) % 4 or len(data) > 4 * MAX_BEAMS:
             raise RecordingError(f"a recorded scan has {len(data)} bytes of ranges; at most {4 * MAX_BEAMS} are read")
-        scalars = {name: (int if name == "sequence" else float)(document[name]) for name in _scan_scalars()}
+        scalars: dict[str, Any] = {name: (int if name == "sequence" else float)(document[name]) for name in _scan_scalars()}
         ranges = np.frombuffer(data, dtype="<f4").astype(np.float32, copy=False)
-        return int(document["scan"]), LidarScan(ranges_m=ranges, **scalars)  # type: ignore[arg-type]
+        return int(document["scan"]), LidarScan(ranges_m=ranges, **scalars)
     except (KeyError, TypeError, ValueError, OverflowError, binascii.Error) as error:
         raise RecordingError(f"a recorded scan is damaged ({type(error).__name__}: {error})") from None
 

@@ -74,7 +74,8 @@ def recover(path: Path, output: Path | None = None) -> Recovery:
             raise RecordingError(f"{target} exists already: give another name with --out")
         _write(path, target)
     except OSError as error:
-        raise RecordingError(f"cannot recover {path}: {error.filename or target}: {error.strerror}") from None
+        elsewhere = "" if str(error.filename) == str(path) else f"{error.filename or target}: "
+        raise RecordingError(f"cannot recover {path}: {elsewhere}{error.strerror}") from None
     result.output = target
     return result
 

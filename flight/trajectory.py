@@ -7,7 +7,7 @@ import logging
 import math
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,12 +201,12 @@ def _draw_path(figure: Figure, axes: Axes, log: FlightLog, truth: NDArray[np.flo
     _mark(axes, flown, braking=True, style={"marker": "X", "color": "#e74c3c", "markersize": 7.0, "zorder": 7}, label="braking")
 
 
-def _mark(axes: Axes, flown: list[TickRecord], *, braking: bool, style: dict[str, object], label: str) -> None:
+def _mark(axes: Axes, flown: list[TickRecord], *, braking: bool, style: dict[str, Any], label: str) -> None:
     marked = [r.position for r in flown if r.verdict.braking is braking and (braking or r.verdict.interventions)]
     if not marked:
         return
     xs, ys = [p.x for p in marked if p is not None], [p.y for p in marked if p is not None]
-    axes.plot(xs, ys, linestyle="none", markeredgewidth=0.0, label=f"{label} ({len(marked)} ticks)", **style)  # type: ignore[arg-type]
+    axes.plot(xs, ys, linestyle="none", markeredgewidth=0.0, label=f"{label} ({len(marked)} ticks)", **style)
 
 
 def _finish(figure: Figure, axes: Axes, title: str) -> None:

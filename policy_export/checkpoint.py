@@ -92,7 +92,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
 
 def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
-        raise CheckpointError(f"{path}: no such file")
+        raise CheckpointError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
     if path.stat().st_size > MAX_CHECKPOINT_BYTES:
         raise CheckpointError(f"{path}: larger than {MAX_CHECKPOINT_BYTES} bytes")
     try:

@@ -1,4 +1,4 @@
-"""The autopilot's mode logic: arming, flight modes, OFFBOARD's stream rule, failsafe, takeoff and landing, as PX4 v1.17 does it.
+"""The autopilot's mode logic: arming, flight modes, OFFBOARD's stream rule, as PX4 v1.17 does it.
 
 Pure logic in vehicle time: no clock, no threads, no sockets. `Autopilot.step` takes the estimated state and returns what the
 velocity loop shall fly; commands come in through methods that return a MAV_RESULT. What the recordings show is the rule here
@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 
-from sim_gateway.attitude_setpoints import AttitudeSetpoint, Thrust
+from sim_gateway.attitude_setpoints import AttitudeSetpoint
+from sim_gateway.autopilot_output import MOTORS_OFF, ControlOutput, ModeChange, StatusText
 from sim_gateway.battery import Battery
 from sim_gateway.failsafes import Failsafes
 from sim_gateway.flight_modes import AUTO_MAIN_MODE, CRITICAL, INFO, FlightMode, LandedState, Result, SystemStatus
@@ -32,56 +32,16 @@ from sim_gateway.mission import Mission, MissionTask
 from sim_gateway.parameters import ParameterStore
 from sim_gateway.setpoints import OffboardSetpoint
 from sim_gateway.sticks import Sticks, moved
+from sim_gateway.takeoff_landing import TakeoffLanding
 
 CONTROL_PERIOD_S = 0.02  # PX4's flight tasks run at 50 Hz
 FORCE_MAGIC = 21196  # param 2 of MAV_CMD_COMPONENT_ARM_DISARM: skip the checks
 READY_AFTER_S = 4.3  # recorded: arming is denied until about here
 
 _ARMING_DENIED = "Arming denied: Resolve system health failures first"
-_LANDING_DETECT_S = 1.8  # recorded 1.7 to 2.3 s from touch down to "Landing detected"
-_CLIMB_WANTED_M_S = 0.05
-_LIFT_OFF_S = 0.35  # recorded: takeoff is detected about that long after the motors have spooled up,
-_LIFT_OFF_OFFBOARD_S = 0.65  # and that long in OFFBOARD by velocity
-_RAMP_START_M_S = 0.9  # the takeoff ramp starts as if descending, so that thrust comes up from its minimum
 _KEPT_TEXTS = 200
 _OVERRIDE_AUTO, _OVERRIDE_OFFBOARD = 1, 2  # bits of COM_RC_OVERRIDE
 _STICKS_DISABLED, _RADIO_ONLY = 4, 0  # COM_RC_IN_MODE values that ignore MANUAL_CONTROL
-
-
-@dataclass(frozen=True, slots=True)
-class StatusText:
-    """One STATUSTEXT: `severity` is MAV_SEVERITY."""
-
-    time_s: float
-    severity: int
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class ModeChange:
-    """The mode from `time_s` on, and whether the vehicle is armed and in failsafe."""
-
-    time_s: float
-    mode: FlightMode
-    intended: FlightMode
-    armed: bool
-    failsafe: bool
-
-
-@dataclass(frozen=True, slots=True)
-class ControlOutput:
-    """What the vehicle's velocity loop shall fly: NED m/s, clockwise rad/s. With motors off the rest is zero.
-
-    `thrust`: past the velocity loop, this instead of a velocity.
-    """
-
-    motors_on: bool
-    velocity: Vector = (0.0, 0.0, 0.0)
-    yaw_rate_rad_s: float = 0.0
-    thrust: Thrust | None = None
-
-
-MOTORS_OFF = ControlOutput(False)
 
 
 class Autopilot:
@@ -125,11 +85,7 @@ class Autopilot:
         self._task_target: Vector | None = None
         self._task_yaw_rad: float | None = None
         self._takeoff_altitude_m = math.nan
-        self._armed_at_s = 0.0
-        self._flown = False
-        self._ramp_start_s: float | None = None
-        self._ground_since_s: float | None = None
-        self._landed_at_s = 0.0
+        self._ground = TakeoffLanding(self)
         self._last_step_s: float | None = None
         self.sticks = Sticks()
         self.failsafes.clear()
@@ -205,7 +161,8 @@ class Autopilot:
         if not force and not self.can_arm:
             self.say(CRITICAL, _ARMING_DENIED)
             return Result.TEMPORARILY_REJECTED
-        self.armed, self._flown, self._armed_at_s = True, False, self.now_s
+        self.armed = True
+        self._ground.armed()
         self.home = self.state.position
         self._task = None
         self.say(INFO, "Armed by external command")
@@ -283,7 +240,7 @@ class Autopilot:
     def begin_in_air(self, state: NedState, home: Vector) -> None:
         """Start flying: armed, in Hold, with the takeoff behind it."""
         self.step(state)
-        self.armed, self.landed, self._flown, self.home = True, False, True, home
+        self.armed, self.landed, self._ground.flown, self.home = True, False, True, home
 
     def restart(self) -> None:
         """Power lost and back: motors off, everything but the parameters forgotten."""
@@ -314,8 +271,8 @@ class Autopilot:
         if self._task is None:
             self._task = self._start_task()
         command = self._run(self._task, dt_s)
-        self.output = self._through_takeoff_ramp(command) if command.thrust is None else self._on_thrust(command)
-        self._detect_landing()
+        self.output = self._ground.output(command)
+        self._ground.watch()
         return self.output
 
     def _run(self, task: FlightTask, dt_s: float) -> MotionCommand:
@@ -395,60 +352,11 @@ class Autopilot:
         self.say(INFO, f"RTL: start return at {int(above_sea_m)} m ({int(task.return_height_m)} m above destination)")
         return task
 
-    def _through_takeoff_ramp(self, command: MotionCommand) -> ControlOutput:
-        """Hold a climb back while motors spool up (COM_SPOOLUP_TIME), then let its speed grow over MPC_TKO_RAMP_T."""
-        get, now_s = self.parameters.get, self.now_s
-        north, east, down = command.velocity
-        wants_climb = down < -_CLIMB_WANTED_M_S
-        lift_off_s = _LIFT_OFF_OFFBOARD_S if self.mode is FlightMode.OFFBOARD else _LIFT_OFF_S
-        if self.landed and not (wants_climb and now_s - self._armed_at_s >= get("COM_SPOOLUP_TIME") + lift_off_s):
-            return ControlOutput(True)
-        if self.landed:
-            self._ramp_start_s = now_s
-            self._take_off()
-        if self._ramp_start_s is not None:
-            share = (now_s - self._ramp_start_s) / max(get("MPC_TKO_RAMP_T"), 0.02)
-            climb_limit = -_RAMP_START_M_S + share * (_RAMP_START_M_S + get("MPC_TKO_SPEED"))
-            down = max(down, -climb_limit)
-            if share >= 1.0:
-                self._ramp_start_s = None
-        return ControlOutput(True, (north, east, down), command.yaw_rate_rad_s)
-
-    def _on_thrust(self, command: MotionCommand) -> ControlOutput:
-        """A thrust of the client's own: no ramp, only the time the motors need to spool up."""
-        if self.landed and self.now_s - self._armed_at_s < self.parameters.get("COM_SPOOLUP_TIME"):
-            return ControlOutput(True)
-        if self.landed and not self.state.on_ground:
-            self._take_off()
-        return ControlOutput(True, yaw_rate_rad_s=command.yaw_rate_rad_s, thrust=command.thrust)
-
-    def _take_off(self) -> None:
-        self.landed, self._flown = False, True
-        self.say(INFO, "Takeoff detected")
-
-    def _detect_landing(self) -> None:
-        """Landed after a while on the ground without wanting up; then the disarm timers run."""
-        now_s, get = self.now_s, self.parameters.get
-        if self.landed:
-            delay_s = get("COM_DISARM_LAND") if self._flown else get("COM_DISARM_PRFLT")
-            ready_s = self._landed_at_s if self._flown else self._armed_at_s + get("COM_SPOOLUP_TIME")
-            if delay_s > 0.0 and now_s - ready_s >= delay_s:
-                self.stop_motors("landing" if self._flown else "auto preflight disarming")
-            return
-        resting = self.state.on_ground and self.output.velocity[2] > -_CLIMB_WANTED_M_S and self._ramp_start_s is None
-        if not resting:
-            self._ground_since_s = None
-        elif self._ground_since_s is None:
-            self._ground_since_s = now_s
-        elif now_s - self._ground_since_s >= _LANDING_DETECT_S:
-            self.landed, self._landed_at_s, self._ground_since_s = True, now_s, None
-            self.say(INFO, "Landing detected")
-
     def stop_motors(self, reason: str) -> None:
         """Motors off; the mode falls back to the last one intended that may be armed in."""
         self.armed = self.failsafe = False
         self.landed = self.landed or self.state.on_ground
-        self._ramp_start_s = self._ground_since_s = None
+        self._ground.stopped()
         self._task_target = self._task_yaw_rad = None
         self.intended = self._after_disarming
         self.output, self.target = MOTORS_OFF, OffboardSetpoint()

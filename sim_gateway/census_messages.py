@@ -14,16 +14,6 @@ from sim_gateway.autopilot import Autopilot
 from sim_gateway.local_frame import LocalFrame, Vector
 from sim_gateway.newer_messages import CurrentEventSequence, LinkNodeStatus, TimeEstimateToTarget
 
-# message: (Hz on the onboard link, Hz on the ground station link)
-RATES_HZ: dict[str, tuple[float, float]] = {
-    "CURRENT_EVENT_SEQUENCE": (1 / 3, 1 / 3),
-    "GNSS_INTEGRITY": (1, 1),
-    "LINK_NODE_STATUS": (1, 1),
-    "OPEN_DRONE_ID_LOCATION": (1, 1),
-    "OPEN_DRONE_ID_SYSTEM": (1, 1),
-    "POSITION_TARGET_GLOBAL_INT": (10, 1),
-    "TIME_ESTIMATE_TO_TARGET": (0.5, 0.5),
-}
 _ID_UNUSED = [0] * 20
 _SPEED_LIMIT_CM_S, _CLIMB_LIMIT_CM_S = 25425, 6200  # largest values that remote id can say
 _NO_ALTITUDE_M = -1000.0

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import sys
 from enum import StrEnum
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -49,7 +51,7 @@ _MOST_VEHICLES = 40  # then the onboard ports would meet the gateway's own
 _PX4_DEFAULT = "tcp:4560"
 _HIGHEST_PORT = 65535 - 4020 - _MOST_VEHICLES  # the gateway's own ports lie up to this far above the client's
 
-app = typer.Typer(add_completion=False, rich_markup_mode="rich")
+app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
 
 
 class Dynamics(StrEnum):
@@ -175,9 +177,16 @@ def serve(
         "serial_link": serial_link,
         "faults": _faults(fault or [], faults),
     }
+    _check_report(report)
     moving: dict[str, Any] = {"speed": speed, "wind_m_s": _triple("--wind", wind)}
-    if (speed == 0.0 or no_gps) and px4 is None:
-        raise UsageError(f"{'--no-gps' if no_gps else '--speed 0'} goes only with --px4")
+    simulator, follower = px4 is not None, follow is not None
+    _refuse("goes only with --px4", {"--no-gps": no_gps and not simulator, "--speed 0": speed == 0.0 and not simulator})
+    _refuse("goes only with --follow", {"--origin": origin is not None and not follower})
+    _refuse("goes only with --serial-lidar", {"--serial-link": serial_link is not None and serial_lidar is None})
+    _refuse("is the onboard client's port: give another, or 0 for none", {"--gcs-port": gcs_port == onboard_port})
+    _refuse("is another role than --follow: choose one", {"--px4": simulator and follower})
+    if simulator or follower:
+        _refuse("goes with neither --px4 nor --follow", {"--vehicles": vehicles > 1, "--link": bool(link)})
     if px4 is not None:
         _be_simulator(scene, quit_with_parent, address=px4, gps=not no_gps, **common, **moving)
     elif follow is not None:
@@ -190,6 +199,13 @@ def serve(
         ports = {"onboard_port": onboard_port, "gcs_port": gcs_port, "links": _links(link or [])}
         kinds = {"dynamics": dynamics.value, "vehicle": vehicle.value, "estimate": estimate.value}
         _stand_in(scene, vehicles, quit_with_parent, **ports, **kinds, **common, **moving)
+
+
+def _refuse(why: str, options: dict[str, bool]) -> None:
+    """Refuse the first option that was given although it means nothing here."""
+    for option, given in options.items():
+        if given:
+            raise UsageError(f"{option} {why}")
 
 
 def _stand_in(world: World, vehicles: int, quit_with_parent: bool, **settings: Any) -> None:
@@ -252,6 +268,18 @@ def _links(texts: list[str]) -> tuple[LinkSpec, ...]:
         raise UsageError(str(error)) from None
 
 
+def _check_report(path: Path | None) -> None:
+    """The report is written when the run ends: that it cannot be must be told before."""
+    if path is None:
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"--report {path}: {path.parent}: {error.strerror}") from None
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise UsageError(f"--report {path}: {'is a folder' if path.is_dir() else 'cannot be written'}: name another file")
+
+
 def _numbers(option: str, text: str, count: int) -> list[float]:
     try:
         values = [float(part) for part in text.split(",")]
@@ -286,7 +314,7 @@ def _log_to_stderr(verbose: bool) -> None:
 def completed(arguments: list[str]) -> list[str]:
     """The arguments with the value that `--px4` alone stands for."""
     given: list[str] = []
-    for argument, after in zip(arguments, [*arguments[1:], "--"], strict=True):
+    for argument, after in pairwise([*arguments, "--"]):
         given += [argument, _PX4_DEFAULT] if argument == "--px4" and after.startswith("-") else [argument]
     return given
 
@@ -307,6 +335,6 @@ def main() -> None:
     except Exception as error:
         if not hasattr(error, "format_message"):  # typer's usage errors have no public base class
             raise
-        print(f"sim-gateway: {error.format_message()} See sim-gateway --help.", file=sys.stderr)
+        print(f"sim-gateway: {error.format_message().rstrip('.')}; see sim-gateway --help", file=sys.stderr)
         code = 2
     sys.exit(int(code or 0))

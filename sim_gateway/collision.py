@@ -29,9 +29,3 @@ def clearance_m(boxes: Row, position: Row, radius_m: float) -> float:
                 outside_sq += gap * gap
         nearest = min(nearest, math.sqrt(outside_sq) if inside > 0.0 else inside)
     return nearest - radius_m
-
-
-@njit(cache=True)
-def in_contact(boxes: Row, position: Row, radius_m: float) -> bool:
-    """True when the sphere touches or cuts a box. Arguments as `clearance_m`."""
-    return clearance_m(boxes, position, radius_m) <= 0.0

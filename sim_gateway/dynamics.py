@@ -133,9 +133,10 @@ def watch_clearance(boxes: Array, state: Array, radius: float, log: Array) -> No
 
 
 @njit(cache=True)
-def before_step(  # type: ignore[no-untyped-def]
-    normals_row, wind, wind_mean, gust, gust_coefficients, error, error_coefficients
-):  # fmt: skip
+def before_step(
+    normals_row: Array, wind: Array, wind_mean: Array, gust: Array, gust_coefficients: Array, error: Array,
+    error_coefficients: Array,
+) -> None:  # fmt: skip
     """Wind of this step into `wind` [3], the next estimate errors into `error`."""
     for i in range(3):
         gust[i] = gust_coefficients[0] * gust[i] + gust_coefficients[1] * normals_row[PROCESSES + i]
@@ -144,7 +145,10 @@ def before_step(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def after_step(state, x, y, z, step, boxes, fixed, movers, radius, log):  # type: ignore[no-untyped-def]
+def after_step(
+    state: Array, x: float, y: float, z: float, step: int, boxes: Array, fixed: int, movers: Array, radius: float,
+    log: Array,
+) -> None:  # fmt: skip
     """Path flown since (x, y, z), movers at the end of step number `step`, clearance and contacts."""
     dx, dy, dz = state[POS] - x, state[POS + 1] - y, state[POS + 2] - z
     log[FLOWN] += math.sqrt(dx * dx + dy * dy + dz * dz)
@@ -153,10 +157,11 @@ def after_step(state, x, y, z, step, boxes, fixed, movers, radius, log):  # type
 
 
 @njit(cache=True)
-def _advance(  # type: ignore[no-untyped-def]
-    state, params, velocity_sp, yaw_rate_sp, motors_on, normals, first_step,
-    boxes, fixed, movers, error, error_coefficients, wind_mean, gust, gust_coefficients, radius, log,
-):  # fmt: skip
+def _advance(
+    state: Array, params: Array, velocity_sp: Array, yaw_rate_sp: float, motors_on: bool, normals: Array,
+    first_step: int, boxes: Array, fixed: int, movers: Array, error: Array, error_coefficients: Array, wind_mean: Array,
+    gust: Array, gust_coefficients: Array, radius: float, log: Array,
+) -> int:  # fmt: skip
     """All steps of the internal vehicle, in one call; ends at the first state that is not finite. Gives the step reached."""
     wind = np.empty(3)
     for step in range(normals.shape[0]):
@@ -169,4 +174,4 @@ def _advance(  # type: ignore[no-untyped-def]
         if _first_not_finite(state) >= 0:
             return first_step + step + 1
         after_step(state, x, y, z, first_step + step, boxes, fixed, movers, radius, log)
-    return first_step + normals.shape[0]
+    return first_step + len(normals)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_gateway.autopilot import ModeChange
+from sim_gateway.autopilot_output import ModeChange
 from sim_gateway.scene import World
 from sim_gateway.simulation import Simulation
 

@@ -17,7 +17,7 @@ from sim_gateway.local_frame import LocalFrame
 from sim_gateway.mavlink_frame import FramePacker, Message
 from sim_gateway.motor_dynamics import MotorDynamics
 from sim_gateway.simulation import Simulation
-from sim_gateway.telemetry import rotate_to_body
+from sim_gateway.snapshot import rotate_to_body
 from sim_gateway.vehicle import OMEGA, STEP_S
 from sim_gateway.vehicle_params import GRAVITY_M_S2
 

@@ -148,10 +148,11 @@ def _radii_m() -> tuple[float, float]:
 
 
 @njit(cache=True)
-def _prepare(  # type: ignore[no-untyped-def]
-    state, params, velocity_sp, yaw_rate_sp, motors_on, normals_row, wind,
-    wind_mean, gust, gust_coefficients, error, error_coefficients, loads,
-):  # fmt: skip
+def _prepare(
+    state: Array, params: Array, velocity_sp: Array, yaw_rate_sp: float, motors_on: bool, normals_row: Array,
+    wind: Array, wind_mean: Array, gust: Array, gust_coefficients: Array, error: Array, error_coefficients: Array,
+    loads: Array,
+) -> bool:  # fmt: skip
     """Wind, errors, cascade, motors; `loads` [8] as in `_LOADS`. Whether the vehicle is in the air in this step."""
     before_step(normals_row, wind, wind_mean, gust, gust_coefficients, error, error_coefficients)
     drive_motors(state, params, velocity_sp, yaw_rate_sp, error[VELOCITY_ERROR : VELOCITY_ERROR + 3], motors_on)
@@ -164,11 +165,11 @@ def _prepare(  # type: ignore[no-untyped-def]
     lift_n = (loads[0] + loads[1] + loads[2] + loads[3]) * _POUND_N
     if state[LANDED] > 0.0 and lift_n > params[vp.MASS] * GRAVITY_M_S2:
         state[LANDED] = 0.0
-    return state[LANDED] == 0.0
+    return bool(state[LANDED] == 0.0)
 
 
 @njit(cache=True)
-def _motion_to_place(state, row):  # type: ignore[no-untyped-def]
+def _motion_to_place(state: Array, row: Array) -> None:
     """The state row's motion as in `_PLACE`."""
     meridian_m, across_m = _radii_m()
     row[0] = _ORIGIN_LATITUDE_RAD + state[POS] / meridian_m
@@ -183,7 +184,7 @@ def _motion_to_place(state, row):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _take_over(state, reading):  # type: ignore[no-untyped-def]
+def _take_over(state: Array, reading: Array) -> None:
     """JSBSim's motion, as in `_READING`, into the state row; below the ground plane it touches down."""
     meridian_m, across_m = _radii_m()
     state[POS] = (reading[0] - _ORIGIN_LATITUDE_RAD) * meridian_m

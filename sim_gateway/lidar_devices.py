@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_gateway.readings import Scan
 from sim_gateway.scip import ScipServer
 from sim_gateway.serial_lidar import SerialLidar
-from sim_gateway.simulation import Scan, Simulation, step_at
+from sim_gateway.simulation import Simulation, step_at
 
 _SCAN_PERIOD_S = 0.05
 

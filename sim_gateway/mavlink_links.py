@@ -17,12 +17,13 @@ from collections.abc import Callable, Iterator
 
 from pymavlink.dialects.v20 import development as mav
 
-from sim_gateway.autopilot import StatusText
+from sim_gateway.autopilot_output import StatusText
 from sim_gateway.link_conditions import LinkConditions
 from sim_gateway.link_faults import Garbage, LinkFaults
 from sim_gateway.link_spec import LOOPBACK
 from sim_gateway.mavlink_frame import FramePacker
-from sim_gateway.telemetry import COMPONENT_ID, STREAM_RATES_HZ, SYSTEM_ID, Message
+from sim_gateway.stream_rates import STREAM_RATES_HZ
+from sim_gateway.telemetry import COMPONENT_ID, SYSTEM_ID, Message
 
 _ANY_ADDRESS = "0.0.0.0"
 _MAX_DATAGRAM = 4096

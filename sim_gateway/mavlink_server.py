@@ -23,7 +23,8 @@ from sim_gateway.mavlink_links import MavlinkLink, PortInUseError, UdpLink
 from sim_gateway.parameters import HASH_INDEX, HASH_NAME, UINT32, ParameterStore
 from sim_gateway.setpoints import NAN, NOTHING, SetpointRefusedError, read_setpoint
 from sim_gateway.sticks import from_manual_control
-from sim_gateway.telemetry import COMPONENT_ID, GROUND, ONBOARD, Message, Telemetry
+from sim_gateway.stream_rates import GROUND, ONBOARD
+from sim_gateway.telemetry import COMPONENT_ID, Message, Telemetry
 from sim_gateway.vehicle_log import VehicleLog
 from sim_gateway.wire_log import WireLog
 

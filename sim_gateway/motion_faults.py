@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_gateway import vehicle_params as vp
 from sim_gateway.faults import MOTION, Active, FaultSchedule
+from sim_gateway.readings import Motion
 from sim_gateway.vehicle import STEP_S
-
-if TYPE_CHECKING:
-    from sim_gateway.simulation import Motion
 
 Array = NDArray[np.float64]
 _CHUNK_STEPS = 5  # what changes while a fault lasts (a gust, a drift) is renewed every 20 ms

@@ -88,10 +88,11 @@ def standing_height_m(params: VehicleParams) -> float:
 
 
 @njit(cache=True)
-def _advance(  # type: ignore[no-untyped-def]
-    state, params, motors, contacts, commands, inertial, normals, first_step,
-    boxes, fixed, movers, error, error_coefficients, wind_mean, gust, gust_coefficients, radius, log,
-):  # fmt: skip
+def _advance(
+    state: Array, params: Array, motors: Array, contacts: Array, commands: Array, inertial: Array, normals: Array,
+    first_step: int, boxes: Array, fixed: int, movers: Array, error: Array, error_coefficients: Array, wind_mean: Array,
+    gust: Array, gust_coefficients: Array, radius: float, log: Array,
+) -> int:  # fmt: skip
     """All steps, in one call; the step reached."""
     wind, turn, force = np.empty(3), np.empty((3, 3)), np.empty(6)
     for step in range(normals.shape[0]):
@@ -102,11 +103,14 @@ def _advance(  # type: ignore[no-untyped-def]
             _substep(state, params, motors, contacts, commands, wind, turn, force, inertial)
         inertial /= _SUBSTEPS
         after_step(state, x, y, z, first_step + step, boxes, fixed, movers, radius, log)
-    return first_step + normals.shape[0]
+    return first_step + len(normals)
 
 
 @njit(cache=True, error_model="numpy")
-def _substep(state, params, motors, contacts, commands, wind, turn, force, inertial):  # type: ignore[no-untyped-def]
+def _substep(
+    state: Array, params: Array, motors: Array, contacts: Array, commands: Array, wind: Array, turn: Array, force: Array,
+    inertial: Array,
+) -> None:  # fmt: skip
     """One semi-implicit Euler step; adds the specific force and the rate to `inertial` [6]."""
     rotation_into(state, turn)
     force[:] = 0.0  # without gravity: force in world axes, torque in body axes
@@ -127,7 +131,7 @@ def _substep(state, params, motors, contacts, commands, wind, turn, force, inert
 
 
 @njit(cache=True, error_model="numpy")
-def _air(state, params, wind, force):  # type: ignore[no-untyped-def]
+def _air(state: Array, params: Array, wind: Array, force: Array) -> None:
     x, y, z = state[VEL] - wind[0], state[VEL + 1] - wind[1], state[VEL + 2] - wind[2]
     drag = params[vp.DRAG_LINEAR] + params[vp.DRAG_QUADRATIC] * math.sqrt(x * x + y * y + z * z)
     force[0], force[1], force[2] = -drag * x, -drag * y, -drag * z
@@ -136,7 +140,7 @@ def _air(state, params, wind, force):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _propellers(state, params, motors, commands, turn, force):  # type: ignore[no-untyped-def]
+def _propellers(state: Array, params: Array, motors: Array, commands: Array, turn: Array, force: Array) -> None:
     gain = 1.0 - math.exp(-_SUBSTEP_S / params[vp.MOTOR_LAG])
     total = 0.0
     for m in range(4):
@@ -151,7 +155,7 @@ def _propellers(state, params, motors, commands, turn, force):  # type: ignore[n
 
 
 @njit(cache=True, error_model="numpy")
-def _ground(state, contacts, turn, force):  # type: ignore[no-untyped-def]
+def _ground(state: Array, contacts: Array, turn: Array, force: Array) -> float:
     """Springs, dampers and friction where the body is in the ground; 1 if it is anywhere, else 0."""
     touching = 0.0
     p, q, r = state[OMEGA], state[OMEGA + 1], state[OMEGA + 2]
@@ -181,7 +185,7 @@ def _ground(state, contacts, turn, force):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _turn(state, params, force):  # type: ignore[no-untyped-def]
+def _turn(state: Array, params: Array, force: Array) -> None:
     """Euler's equation and the quaternion kinematics under the torques in `force`."""
     ixx, iyy, izz = params[vp.IXX], params[vp.IYY], params[vp.IZZ]
     p, q, r = state[OMEGA], state[OMEGA + 1], state[OMEGA + 2]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import development as mav
 
-from sim_gateway.simulation import Scan
+from sim_gateway.readings import Scan
 
 SECTORS, SECTOR_DEG = 72, 5
 UNKNOWN = 65_535

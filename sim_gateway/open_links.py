@@ -14,7 +14,7 @@ from sim_gateway.mavlink_links import MavlinkLink, PortInUseError, UdpLink
 from sim_gateway.pty_port import PtyPort
 from sim_gateway.serial_port import SerialPort
 from sim_gateway.stream_links import SerialLink, TcpLink
-from sim_gateway.telemetry import GROUND, ONBOARD
+from sim_gateway.stream_rates import GROUND, ONBOARD
 
 # distance from the port a client listens on to the gateway's own port, as in PX4's SITL (14580 - 14540, 18570 - 14550)
 ONBOARD_PORT_OFFSET, GROUND_PORT_OFFSET = 40, 4020

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 
-from sim_gateway.autopilot import CONTROL_PERIOD_S, MOTORS_OFF, Autopilot, ControlOutput
+from sim_gateway.autopilot import CONTROL_PERIOD_S, Autopilot
+from sim_gateway.autopilot_output import MOTORS_OFF, ControlOutput
 from sim_gateway.local_frame import LocalFrame, NedState, Vector
 from sim_gateway.parameters import ParameterStore
-from sim_gateway.simulation import Motion, Simulation
-from sim_gateway.telemetry import Quaternion, Snapshot, rotate_to_body
+from sim_gateway.readings import Motion
+from sim_gateway.simulation import Simulation
+from sim_gateway.snapshot import Quaternion, Snapshot, rotate_to_body
 from sim_gateway.vehicle import MOTOR, STEP_S
 
 CONTROL_STEPS = round(CONTROL_PERIOD_S / STEP_S)

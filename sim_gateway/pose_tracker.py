@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sim_gateway.local_frame import Vector
-from sim_gateway.telemetry import Quaternion
+from sim_gateway.snapshot import Quaternion
 
 MESSAGES = ("LOCAL_POSITION_NED", "ATTITUDE", "ATTITUDE_QUATERNION", "ODOMETRY", "TIMESYNC")
 _WINDOW_S = 3.0  # of the clock's samples: a simulated vehicle's clock may stand still for a while

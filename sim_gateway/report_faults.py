@@ -8,7 +8,8 @@ from dataclasses import replace
 from sim_gateway.faults import REPORT, Active, FaultSchedule
 from sim_gateway.local_frame import Vector
 from sim_gateway.motion_faults import MotionFaults
-from sim_gateway.telemetry import Message, Snapshot
+from sim_gateway.snapshot import Snapshot
+from sim_gateway.telemetry import Message
 
 _PLACE = ("LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT")
 _MOTION = (*_PLACE, "ATTITUDE", "ATTITUDE_QUATERNION", "HIGHRES_IMU")

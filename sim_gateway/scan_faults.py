@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_gateway.faults import SCAN, Active, FaultSchedule
-
-if TYPE_CHECKING:
-    from sim_gateway.simulation import Scan
+from sim_gateway.readings import Scan
 
 Ranges = NDArray[np.float32]
 

@@ -49,6 +49,10 @@ def _usage_errors() -> Iterator[None]:
         raise UsageError(f"{error} with --lidar-port") from None
     except FileExistsError as error:
         raise UsageError(f"{error.filename2} exists and is not a link: name another (--serial-link, --link pty:)") from None
+    except OSError as error:
+        if error.filename is None:  # not about a path that somebody named
+            raise
+        raise UsageError(f"{error.filename2 or error.filename}: {error.strerror}") from None
 
 
 def serve_fleet(world: World, config: GatewayConfig, vehicles: int, quit_with_parent: bool) -> None:

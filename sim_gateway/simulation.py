@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from sim_gateway.collision import clearance_m
@@ -32,9 +31,7 @@ from sim_gateway.dynamics import (
 )
 from sim_gateway.estimate import (
     ACCELERATION_SIGMA,
-    ATTITUDE_ERROR,
     ERROR_SIZE,
-    POSITION_BIAS,
     POSITION_ERROR,
     PROCESSES,
     VELOCITY_ERROR,
@@ -46,10 +43,10 @@ from sim_gateway.estimate import (
 from sim_gateway.faults import Fault, FaultSchedule
 from sim_gateway.lidar import Lidar, LidarConfig
 from sim_gateway.motion_faults import MotionFaults
+from sim_gateway.readings import Motion, NoiseStream, Scan, read_motion
 from sim_gateway.scan_faults import ScanFaults
 from sim_gateway.scene import Boxes, Point, World
 from sim_gateway.vehicle import (
-    ACC,
     BODY_Z_SP,
     LANDED,
     OMEGA,
@@ -60,9 +57,7 @@ from sim_gateway.vehicle import (
     THRUST_SP,
     VEL,
     initial_state,
-    roll_pitch_rad,
     rotation,
-    yaw_rad,
 )
 from sim_gateway.vehicle_params import HOVER_THRUST, VehicleParams
 
@@ -86,67 +81,6 @@ class WindConfig:
             raise ValueError("wind: every value must be finite")
         if self.gust_sigma_m_s < 0.0 or self.gust_time_s <= 0.0:
             raise ValueError("wind: gust_sigma_m_s must not be negative and gust_time_s must be above 0")
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """Motion in the corridor frame, SI: the truth, or the vehicle's estimate of it.
-
-    `acceleration_m_s2`: dv/dt, gravity removed. `roll_rad` right side down, `pitch_rad` nose up, `yaw_rad` counter-clockwise,
-    in [-pi, pi]. `angular_rate_rad_s`: body axes (ahead, left, up).
-    """
-
-    time_s: float
-    position_m: Point
-    velocity_m_s: Point
-    acceleration_m_s2: Point
-    roll_rad: float
-    pitch_rad: float
-    yaw_rad: float
-    angular_rate_rad_s: Point
-
-
-@dataclass(frozen=True, slots=True)
-class Scan:
-    """One scan. `ranges_m`: float32 [beams], right to left; +inf = nothing seen, 0 = nearer than `range_min_m`."""
-
-    time_s: float
-    ranges_m: NDArray[np.float32]
-    angle_min_rad: float
-    angle_increment_rad: float
-    range_min_m: float
-    range_max_m: float
-
-
-@njit(cache=True)
-def _read_motion(state: Array, error: Array, acceleration_error: Array, out: Array) -> None:
-    """Position, velocity, acceleration, roll, pitch, yaw (not wrapped) and body rates with their errors into `out` [15]."""
-    for i in range(3):
-        out[i] = state[POS + i] + error[POSITION_ERROR + i] + error[POSITION_BIAS + i]
-        out[3 + i] = state[VEL + i] + error[VELOCITY_ERROR + i]
-        out[6 + i] = state[ACC + i] + acceleration_error[i]
-        out[12 + i] = state[OMEGA + i]
-    roll, pitch = roll_pitch_rad(state)
-    out[9], out[10], out[11] = (
-        roll + error[ATTITUDE_ERROR],
-        pitch + error[ATTITUDE_ERROR + 1],
-        yaw_rad(state) + error[ATTITUDE_ERROR + 2],
-    )
-
-
-class SensorNoise:
-    """Random numbers of one sensor: counter-based, so that those of a time do not depend on what was read before."""
-
-    def __init__(self, key: NDArray[np.unsignedinteger]) -> None:
-        self._bits = np.random.Philox(key=key)
-        self._generator = np.random.Generator(self._bits)
-        self._fresh = self._bits.state
-
-    def at(self, step: int) -> np.random.Generator:
-        """The generator at the start of its numbers for a step. The same object each time: draw before asking again."""
-        self._fresh["state"]["counter"][2] = step
-        self._bits.state = self._fresh
-        return self._generator
 
 
 def step_at(time_s: float) -> int:
@@ -196,7 +130,7 @@ class Simulation:
         self._reading = np.empty(15)
         self._boxes = world.boxes_at(0.0)
         self._generator = np.random.Generator(np.random.PCG64([seed, 0]))
-        self._sensors = [SensorNoise(np.random.SeedSequence([seed, 1, i]).generate_state(2, np.uint64)) for i in range(2)]
+        self._sensors = [NoiseStream(np.random.SeedSequence([seed, 1, i]).generate_state(2, np.uint64)) for i in range(2)]
         self._start_errors(estimate_preset(estimate) if isinstance(estimate, str) else estimate)
         self._start_wind(wind)
         self.faults = FaultSchedule()
@@ -323,7 +257,7 @@ class Simulation:
         return self._acceleration_sigma * self._sensors[_ACCELERATION_STREAM].at(self.steps).standard_normal(3)
 
     def _motion(self, error: Array, acceleration_error: Array) -> Motion:
-        _read_motion(self._state, error, acceleration_error, self._reading)
+        read_motion(self._state, error, acceleration_error, self._reading)
         x, y, z, vx, vy, vz, ax, ay, az, roll, pitch, heading, p, q, r = self._reading.tolist()
         yaw = math.remainder(heading, 2.0 * math.pi)
         return Motion(self.time_s, (x, y, z), (vx, vy, vz), (ax, ay, az), roll, pitch, yaw, (p, q, r))

@@ -1,15 +1,11 @@
-"""Telemetry: how each MAVLink message is filled from the vehicle, and how often PX4 sends it on which link.
-
-Rates are those of link_census.json (PX4 v1.17 SITL defaults). A message begins at the vehicle time at which PX4's first one was
-recorded after start-up (lifecycle.json).
-"""
+"""Telemetry: how each MAVLink message is filled from the vehicle. How often it is sent: `stream_rates`."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from pymavlink.dialects.v20 import development as mav
@@ -20,59 +16,16 @@ from sim_gateway.flight_modes import FlightMode
 from sim_gateway.local_frame import LocalFrame, Vector
 from sim_gateway.newer_messages import NEWER_IDS
 from sim_gateway.obstacle_distance import obstacle_distance
+from sim_gateway.readings import Scan
 from sim_gateway.setpoints import OffboardSetpoint
-from sim_gateway.simulation import Scan
+from sim_gateway.snapshot import Snapshot, rotate_to_body
+from sim_gateway.stream_rates import FROM_S, LOCAL_FROM_S, POSITION_FLAG_FROM_S, STREAM_RATES_HZ
 
 if TYPE_CHECKING:
     from sim_gateway.report_faults import ReportFaults
 
 Message = Any  # pymavlink publishes no types
-Quaternion = tuple[float, float, float, float]
 SYSTEM_ID, COMPONENT_ID = 1, 1
-
-GPS_FROM_S, LOCAL_FROM_S, HEARTBEAT_FROM_S, HOME_FROM_S, GLOBAL_FROM_S, POSITION_FLAG_FROM_S = 0.75, 0.78, 1.75, 2.76, 3.2, 3.77
-
-# message: (Hz on the onboard link, Hz on the ground station link); 0: only when asked for
-STREAM_RATES_HZ: dict[str, tuple[float, float]] = {
-    "ALTITUDE": (10, 1),
-    "ATTITUDE": (100, 50),
-    "ATTITUDE_QUATERNION": (50, 50),
-    "ATTITUDE_TARGET": (10, 50),
-    "BATTERY_STATUS": (0.5, 0.5),
-    "CURRENT_MODE": (0.5, 0.5),
-    "DISTANCE_SENSOR": (10, 0.5),
-    "ESTIMATOR_STATUS": (1, 0.5),
-    "EXTENDED_SYS_STATE": (5, 1),
-    "GLOBAL_POSITION_INT": (50, 50),
-    "GPS_GLOBAL_ORIGIN": (0, 0),
-    "GPS_RAW_INT": (8, 5),
-    "HEARTBEAT": (1, 1),
-    "HIGHRES_IMU": (50, 0),
-    "HOME_POSITION": (0.5, 0.5),
-    "LOCAL_POSITION_NED": (30, 50),
-    "MISSION_CURRENT": (1, 1),
-    "OBSTACLE_DISTANCE": (0, 0),
-    "ODOMETRY": (30, 0),
-    "PING": (1, 0.1),
-    "POSITION_TARGET_LOCAL_NED": (10, 50),
-    "SCALED_PRESSURE": (1, 1),
-    "SERVO_OUTPUT_RAW": (10, 50),
-    "SYSTEM_TIME": (1, 0),
-    "SYS_STATUS": (5, 1),
-    "TIMESYNC": (10, 0),
-    "VFR_HUD": (10, 4),
-    "VIBRATION": (0.5, 0.1),
-    **more.RATES_HZ,
-}
-ONBOARD, GROUND = 0, 1  # column of STREAM_RATES_HZ
-_FROM_S = {
-    "GPS_RAW_INT": GPS_FROM_S,
-    "LOCAL_POSITION_NED": LOCAL_FROM_S,
-    "ODOMETRY": LOCAL_FROM_S,
-    "HEARTBEAT": HEARTBEAT_FROM_S,
-    "HOME_POSITION": HOME_FROM_S,
-    "GLOBAL_POSITION_INT": GLOBAL_FROM_S,
-}
 
 _SENSORS = 0x1 | 0x2 | 0x4 | 0x8  # gyro, accelerometer, magnetometer, barometer
 _CONTROLS = 0x400 | 0x800 | 0x1000 | 0x2000 | 0x4000 | 0x8000
@@ -81,31 +34,6 @@ _POSITION_FLAGS = 2 | 8 | 16  # of ESTIMATOR_STATUS: horizontal velocity, relati
 _TERRAIN_FLAG, _PREDICTED_FLAGS = 64, 256 | 512
 _MAGNETIC_FIELD_NED_GAUSS: Vector = (0.212, 0.009, 0.427)  # at PX4's default place
 _EPOCH_US = int(time.time() * 1e6)
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """The vehicle at one instant as its own autopilot believes it: NED and FRD, SI, radians. Motors 0..1."""
-
-    time_s: float
-    position: Vector
-    velocity: Vector
-    attitude: Quaternion  # body FRD to NED, w x y z
-    roll_pitch_yaw: Vector
-    body_rates: Vector
-    specific_force: Vector  # body, gravity included as an accelerometer sees it
-    motors: tuple[float, float, float, float]
-
-
-def rotate_to_body(attitude: Quaternion, vector: Vector) -> Vector:
-    """A NED vector in body axes."""
-    w, x, y, z = attitude
-    a, b, c = vector
-    return (
-        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c,
-        2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c,
-        2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c,
-    )
 
 
 def _heading_deg(yaw_rad: float) -> float:
@@ -159,7 +87,7 @@ class Telemetry:
             return False
         if self.faults is not None and self.faults.silences(name, self.now_s()):
             return False
-        return self.now_s() - self.booted_s >= _FROM_S.get(name, LOCAL_FROM_S)
+        return self.now_s() - self.booted_s >= FROM_S.get(name, LOCAL_FROM_S)
 
     def boot_s(self) -> float:
         """The vehicle's own clock: time since its last start."""

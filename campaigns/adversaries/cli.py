@@ -21,6 +21,7 @@ from campaigns.adversaries.liveness import run_liveness
 from campaigns.adversaries.pool import run_all
 from campaigns.adversaries.report import Block, gather, heat_map, markdown, passed
 from campaigns.adversaries.trace import Trace
+from campaigns.command_line import positive, prepare_output, run_command
 
 SAVE_EVERY_S = 20.0
 
@@ -30,8 +31,8 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m campaigns.adversaries", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--ticks", type=int, default=1_000_000, help="at least this many in the main block")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes; default: all cores")
+    parser.add_argument("--ticks", type=positive, default=1_000_000, help="at least this many in the main block")
+    parser.add_argument("--jobs", type=positive, default=os.cpu_count() or 1, help="processes; default: all cores")
     parser.add_argument("--seed", type=int, default=0, help="first seed")
     parser.add_argument("--out", type=Path, help="result as JSON, with a heat map beside it; with --replay: the picture")
     parser.add_argument("--replay", metavar="CASE", help="fly one case of a result file again, tick by tick")
@@ -41,7 +42,7 @@ def arguments() -> argparse.Namespace:
 def campaign(chosen: argparse.Namespace) -> int:
     """Fly everything; partial results are saved on the way."""
     out: Path = chosen.out or Path("results/adversaries.json")
-    out.parent.mkdir(parents=True, exist_ok=True)
+    prepare_output(out, beside=(".png",))
     began = saved = time.monotonic()
     blocks: dict[str, Block] = {}
     try:
@@ -72,12 +73,13 @@ def _save(out: Path, chosen: argparse.Namespace, blocks: dict[str, Block], more:
 
 def show(case: Case, out: Path | None) -> int:
     """Fly one case again; a line per tick, and a picture."""
+    if out is not None:
+        prepare_output(out)
     trace = Trace()
     result = replay(case, trace.watch)
     print("\n".join(trace.lines()))
     print(json.dumps(result.row()))
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
         trace.picture(out, str(case))
     return 1 if result.outcome.events else 0
 
@@ -85,8 +87,5 @@ def show(case: Case, out: Path | None) -> int:
 def main() -> None:
     """Entry point."""
     chosen = arguments()
-    try:
-        sys.exit(campaign(chosen) if chosen.replay is None else show(Case.parse(chosen.replay), chosen.out))
-    except ValueError as mistake:
-        print(f"adversaries: {mistake}", file=sys.stderr)
-        sys.exit(2)
+    fly = (lambda: campaign(chosen)) if chosen.replay is None else (lambda: show(Case.parse(chosen.replay), chosen.out))
+    run_command("adversaries", fly, ValueError)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from itertools import islice
-from multiprocessing import get_context
 from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from campaigns.adversaries.cases import MAIN, Case, Result, run_case
+from campaigns.workers import process_pool
 
 _AHEAD = 4  # cases per process that wait for their turn
 
@@ -37,7 +37,7 @@ def spread(function: Callable[[Item], Done], items: Iterable[Item], jobs: int) -
         yield from map(function, items)
         return
     waiting, running = iter(items), set[Future[Done]]()
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+    with process_pool(jobs) as pool:
         while True:
             running |= {pool.submit(function, item) for item in islice(waiting, _AHEAD * jobs - len(running))}
             if not running:

@@ -22,6 +22,7 @@ from typing import Any
 
 from campaigns.clients import mavproxy
 from campaigns.clients.report import markdown
+from campaigns.command_line import prepare_output, run_command
 from campaigns.ports import free_port
 from flight.gateway_process import GatewayProcess
 
@@ -66,15 +67,22 @@ def version_in(python: str, *distributions: str) -> str:
     return found
 
 
+def over_grpc(python: str) -> Callable[[int, int, Path], Shown]:
+    """MAVSDK's gRPC package in the environment of this Python."""
+
+    def perform(port: int, _ground: int, _folder: Path) -> Shown:
+        return by_script(python, "over_grpc", f"udpin://127.0.0.1:{port}", str(free_port(socket.SOCK_STREAM)))
+
+    return perform
+
+
 def chosen(arguments: argparse.Namespace) -> dict[str, Callable[[int, int, Path], Shown]]:
     """The clients that can be flown here, by name and version."""
     clients: dict[str, Callable[[int, int, Path], Shown]] = {
         f"mavsdk {version('mavsdk')}": lambda port, _, __: by_script(sys.executable, "native", f"udpin://127.0.0.1:{port}")
     }
     for python in arguments.mavsdk_grpc_python:
-        clients[f"{version_in(python, 'mavsdk-grpc', 'mavsdk')} (gRPC)"] = lambda port, _, __, p=python: by_script(  # type: ignore[misc]
-            p, "over_grpc", f"udpin://127.0.0.1:{port}", str(free_port(socket.SOCK_STREAM))
-        )
+        clients[f"{version_in(python, 'mavsdk-grpc', 'mavsdk')} (gRPC)"] = over_grpc(python)
     if arguments.mavproxy is not None:
         name = version_in(str(arguments.mavproxy.parent / "python"), "MAVProxy")
         clients[name] = lambda _, ground, folder: mavproxy.perform(arguments.mavproxy, ground, folder)
@@ -83,19 +91,21 @@ def chosen(arguments: argparse.Namespace) -> dict[str, Callable[[int, int, Path]
 
 def main() -> int:
     """Command line; exit code 1 when a client saw something that a vehicle would not show it."""
-    parser = argparse.ArgumentParser(prog="python -m campaigns.clients", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m campaigns.clients", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--mavsdk-grpc-python", action="append", default=[], help="a Python that has mavsdk-grpc; repeatable")
     parser.add_argument("--mavproxy", type=Path, help="mavproxy.py of an environment that has MAVProxy")
     parser.add_argument("--out", type=Path, required=True, help="result (JSON)")
     arguments = parser.parse_args()
+    prepare_output(arguments.out)
     clients = {name: with_gateway(fly) for name, fly in chosen(arguments).items()}
     command = "python -m campaigns.clients --mavsdk-grpc-python PATH --mavproxy PATH --out results/clients.json"
     result = {"command": command, "world": WORLD.name, "clients": clients}
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
     arguments.out.write_text(json.dumps(result, indent=1) + "\n")
     sys.stdout.write(markdown(result) + "\n")
     return 0 if all(step["ok"] for shown in clients.values() for step in shown) else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command("clients", main)

@@ -9,16 +9,16 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from campaigns.errors import USER_ERRORS
+from campaigns.command_line import positive, prepare_output, run_command
 
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m campaigns.faults", description=__doc__)
     parser.add_argument("--mission", type=Path, default=Path("configs/corridor.yaml"))
-    parser.add_argument("--seeds", type=int, default=5, help="runs of each fault in each scene")
+    parser.add_argument("--seeds", type=positive, default=5, help="runs of each fault in each scene")
     parser.add_argument("--only", help="ids of the catalogue, separated by commas")
     parser.add_argument("--scenes", help="scenes, separated by commas; default: all")
-    parser.add_argument("--jobs", type=int, help="processes; default: all cores")
+    parser.add_argument("--jobs", type=positive, help="processes; default: all cores")
     parser.add_argument("--realtime", action="store_true", help="fly over MAVSDK against the gateway, one flight per fault")
     parser.add_argument("--out", type=Path, default=Path("runs/faults.json"), help="JSON; the plot and the table lie beside it")
     return parser.parse_args()
@@ -54,6 +54,7 @@ def _realtime(arguments: argparse.Namespace) -> dict[str, Any]:
 def main() -> int:
     """Exit code 1 when any reaction was wrong or late."""
     arguments = _arguments()
+    prepare_output(arguments.out, beside=(".md", ".png"))
     for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     result = _realtime(arguments) if arguments.realtime else _lockstep(arguments)
@@ -65,7 +66,6 @@ def main() -> int:
 
 
 def _keep(result: dict[str, Any], out: Path) -> None:
-    out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps(result, indent=1) + "\n")
 
 
@@ -78,8 +78,4 @@ def _write(result: dict[str, Any], out: Path) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (*USER_ERRORS, ValueError) as mistake:
-        print(f"faults: {mistake}", file=sys.stderr)
-        sys.exit(2)
+    run_command("faults", main, ValueError)

@@ -23,7 +23,8 @@ from sim_gateway.piloted import PilotedVehicle
 from sim_gateway.scene import World
 from sim_gateway.scip_device import ScipDevice
 from sim_gateway.simulation import Simulation, step_at
-from sim_gateway.telemetry import ONBOARD, Telemetry
+from sim_gateway.stream_rates import ONBOARD
+from sim_gateway.telemetry import Telemetry
 
 DOWNLINK_S, UPLINK_S, SCAN_S = 0.004, 0.008, 0.016
 BOOTED_S = -60.0  # the autopilot has been on for a while

@@ -6,9 +6,8 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -22,6 +21,7 @@ from campaigns.faults.oracle import Verdict
 from campaigns.faults.run import Case, play
 from campaigns.faults.scenes import FLIGHT_SCENES
 from campaigns.faults.stage import load
+from campaigns.workers import process_pool
 from flight.mission import Mission
 from policy_export.runner import PolicyRunner
 from safety.filter import SafetyFilter
@@ -109,7 +109,7 @@ def _played(wanted: list[Case], mission_file: Path, jobs: int) -> Iterator[tuple
     if jobs == 1:
         yield from ((case, run_case(case, mission_file)) for case in wanted)
         return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+    with process_pool(jobs) as pool:
         futures = {pool.submit(run_case, case, mission_file): case for case in wanted}
         for future in as_completed(futures):
             yield futures[future], future.result()

@@ -1,6 +1,7 @@
 """The fault catalogue as data: what is injected, what must follow, within which time, and how that is judged.
 
-Ids are those of the catalogue in docs/safety.md. Bounds count from the first faulty sample at the computer to the setpoint sent.
+The ids are used all over the project (docs/safety.md, Codes). Bounds count from the first faulty sample at the computer to the
+setpoint sent.
 """
 
 from __future__ import annotations
@@ -243,6 +244,6 @@ ELSEWHERE: dict[str, str] = {
     "L17": "glass, black or thin things return no beam: documented residual risk",
     "C2": "process-death matrix (python -m campaigns.process_death)",
     "C3": "process-death matrix (python -m campaigns.process_death)",
-    "C9": "memory limit: soak test (python -m benchmarks soak)",
-    "C13": "leak of descriptors or threads: soak test (python -m benchmarks soak)",
+    "C9": "memory limit: an hour of ticks (python -m benchmarks memory)",
+    "C13": "leak of descriptors or threads: an hour of ticks (python -m benchmarks memory)",
 }

@@ -15,6 +15,7 @@ from typing import Any
 from pymavlink.dialects.v20 import development as mav
 
 from campaigns.faults.air import DOWNLINK_S, Air
+from flight.connection import OWN_COMPONENT_ID, OWN_SYSTEM_ID
 from flight.guard.core import STILL, Command, GuardCore, Reason, State, Velocity
 from flight.guard.wire import ModeReport
 from flight.lidar.config import LidarSource
@@ -22,7 +23,7 @@ from flight.lidar.driver import BREAKS, LidarHealth
 from flight.lidar.inbox import Inbox
 from flight.lidar.scip_session import ScipSession
 from flight.lidar.session import Host
-from flight.link import OWN_COMPONENT_ID, OWN_SYSTEM_ID, VehicleLink
+from flight.link import VehicleLink
 from safety.messages import LidarScan
 from sim_gateway.link_faults import Garbage
 from sim_gateway.vehicle import STEP_S

@@ -142,6 +142,8 @@ def trace_of(report: dict[str, Any], felt_after_s: float = 0.0) -> Trace:
 def fly_all(mission_file: Path, only: list[str] | None, command: str, keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     """One flight after the other; each is told as soon as it is over, and `keep` gets all results so far."""
     policy = load_mission(mission_file).policy.path
+    if unknown := set(only or ()) - set(FLOWN):
+        raise ValueError(f"not flown in real time: {', '.join(sorted(unknown))}; there are: {', '.join(FLOWN)}")
     chosen = [ENTRIES[name] for name in FLOWN if only is None or name in only]
     results = []
     for entry in chosen:

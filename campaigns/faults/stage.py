@@ -34,7 +34,6 @@ from sim_gateway.flight_modes import FlightMode
 
 WARM_UP_S = 0.5
 OBSERVED_S = 6.0
-FOLLOWED_S = 3.5  # after the fault has ended
 
 
 class ProcessDeathError(BaseException):

@@ -20,6 +20,7 @@ from pathlib import Path
 for _name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+from campaigns.command_line import positive, prepare_output, run_command
 from campaigns.mutation.hunt import Task, hunt_all
 from campaigns.mutation.ledger import KILLED, Ledger, Verdict
 from campaigns.mutation.mutants import Mutant, sources
@@ -34,11 +35,11 @@ def options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m campaigns.mutation", description=(__doc__ or "").split("\n", maxsplit=1)[0])
     parser.add_argument("--out", type=Path, help="write the result to this JSON file")
     parser.add_argument("--module", action="append", help="only this file, e.g. safety/limits.py; may be repeated")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="mutants at a time")
+    parser.add_argument("--jobs", type=positive, default=os.cpu_count() or 1, help="mutants at a time")
     parser.add_argument("--work", type=Path, default=Path("runs/mutation"), help="folder of the ledger and the map of the tests")
     parser.add_argument("--fresh", action="store_true", help="forget all verdicts first")
     parser.add_argument("--budget-s", type=float, default=math.inf, help="per mutant, only the fastest tests of this much time")
-    parser.add_argument("--sample", type=int, help="only so many mutants of each file, chosen at random")
+    parser.add_argument("--sample", type=positive, help="only so many mutants of each file, chosen at random")
     parser.add_argument("--without", nargs="*", default=list(SLOW), help="test files that are left out")
     parser.add_argument("--list", action="store_true", help="print the survivors that have no proof")
     return parser.parse_args()
@@ -54,6 +55,10 @@ def show(mutant: Mutant, verdict: Verdict) -> None:
 def main() -> int:
     """Run what has no verdict yet; 0 when every mutant is killed or proved equivalent."""
     chosen, root, begin = options(), Path.cwd(), time.monotonic()
+    if unknown := set(chosen.module or ()) - set(sources(root)):
+        raise ValueError(f"no such file of safety/: {', '.join(sorted(unknown))}; write it as safety/limits.py")
+    if chosen.out:
+        prepare_output(chosen.out)
     chosen.work.mkdir(parents=True, exist_ok=True)
     sys.pycache_prefix, sys.dont_write_bytecode = str(chosen.work / "pycache"), False  # children find test files compiled
     ledger_path = chosen.work / "ledger.sqlite"
@@ -87,7 +92,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except BaselineError as error:
-        sys.exit(f"mutation: {error}")
+    run_command("mutation", main, BaselineError, ValueError)

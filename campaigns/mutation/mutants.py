@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import difflib
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,14 +131,6 @@ def definitions(source: str) -> dict[int, tuple[int, int]]:
             for line in range(span[0], span[1] + 1):
                 spans.setdefault(line, span)
     return spans
-
-
-def by_path(mutants: list[Mutant]) -> dict[str, list[Mutant]]:
-    """Mutants file by file."""
-    result: dict[str, list[Mutant]] = defaultdict(list)
-    for mutant in mutants:
-        result[mutant.path].append(mutant)
-    return dict(result)
 
 
 def sources(root: Path, folder: str = "safety") -> dict[str, str]:

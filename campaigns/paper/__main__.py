@@ -13,16 +13,20 @@ import argparse
 import sys
 from pathlib import Path
 
-from campaigns.errors import USER_ERRORS
+from campaigns.command_line import positive, prepare_output, run_command
 from campaigns.paper.figures import draw_bars, draw_curves, draw_flights
 from campaigns.paper.measures import flown_measures, read_curves, training_measures, write_json
 from campaigns.paper.report import article, make_table, markdown
 from campaigns.paper.runs import Run, study_runs, train_all
-from campaigns.splits import load_splits
+from campaigns.splits import Split, load_splits
 from flight.mission import load_mission
+from safety.config import SafetyConfig
 from strict_yaml import load_config
 from training.checkpoint import CheckpointError
 from training.config import TrainingConfig
+
+TABLE = "table_2.json"
+SPLITS = ("static", "unseen", "dynamic")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -32,16 +36,16 @@ def main(arguments: list[str] | None = None) -> int:
     algorithms = {name: load_config(path, TrainingConfig) for name, path in presets.items()}
     decisions = None if chosen.decisions is None else int(chosen.decisions)
     runs = study_runs(algorithms, chosen.seeds, decisions, chosen.runs)
+    splits, safety = load_splits(list(SPLITS), chosen.splits), load_mission(chosen.mission).safety
+    prepare_output(chosen.out / TABLE)
     train_all(runs, chosen.workers)
-    write_study(runs, chosen)
+    write_study(runs, chosen, splits, safety)
     return 0
 
 
-def write_study(runs: list[Run], chosen: argparse.Namespace) -> None:
+def write_study(runs: list[Run], chosen: argparse.Namespace, splits: dict[str, Split], safety: SafetyConfig) -> None:
     """Fly the trained policies, then write table, figures and reading."""
     out: Path = chosen.out
-    out.mkdir(parents=True, exist_ok=True)
-    splits, safety = load_splits(["static", "unseen", "dynamic"], chosen.splits), load_mission(chosen.mission).safety
     names = list(dict.fromkeys(run.algorithm for run in runs))
     curves = {name: [read_curves(run) for run in runs if run.algorithm == name] for name in names}
     measured = {
@@ -58,7 +62,7 @@ def write_study(runs: list[Run], chosen: argparse.Namespace) -> None:
         f"python -m campaigns.paper --ppo {chosen.ppo} --lstm {chosen.lstm} --seeds {chosen.seeds}{volume} "
         f"--episodes {chosen.episodes} --out {out}"
     )
-    write_json(out / "table_2.json", table | {"command": command})
+    write_json(out / TABLE, table | {"command": command})
     (out / "README.md").write_text(markdown(table, command), encoding="utf-8")
     draw_curves(out, curves, article())
     draw_flights(out, runs[: len(names)], splits["dynamic"], safety)
@@ -74,18 +78,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--runs", type=Path, default=Path("runs/paper"), help="folder of the training runs")
     parser.add_argument("--ppo", type=Path, default=Path("configs/training/paper_ppo.yaml"), help="preset without memory")
     parser.add_argument("--lstm", type=Path, default=Path("configs/training/paper_ppo_lstm.yaml"), help="preset with memory")
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", type=positive, default=5)
     parser.add_argument("--decisions", type=float, help="replaces the presets' training volume")
-    parser.add_argument("--episodes", type=int, default=100, help="flights per policy and split")
-    parser.add_argument("--workers", type=int, help="processes; default: all cores")
+    parser.add_argument("--episodes", type=positive, default=100, help="flights per policy and split")
+    parser.add_argument("--workers", type=positive, help="processes; default: all cores")
     parser.add_argument("--mission", type=Path, default=Path("configs/corridor.yaml"))
     parser.add_argument("--splits", type=Path, default=Path("configs/evaluation.yaml"))
     return parser
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (*USER_ERRORS, CheckpointError) as mistake:
-        print(f"paper: {mistake}", file=sys.stderr)
-        sys.exit(2)
+    run_command("paper", main, CheckpointError)

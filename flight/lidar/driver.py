@@ -19,7 +19,7 @@ from flight.lidar.clock import DeviceClockError
 from flight.lidar.config import LidarSource
 from flight.lidar.inbox import Inbox
 from flight.lidar.motion import BodyMotion
-from flight.lidar.recording import RecordingError
+from flight.lidar.recording import ScanFileError
 from flight.lidar.rplidar import RplidarError
 from flight.lidar.scip import ScipError
 from flight.lidar.session import Host, NoMoreScansError, Session
@@ -28,7 +28,7 @@ from safety.messages import LidarScan
 
 _log = logging.getLogger(__name__)
 
-BREAKS = (TransportError, ScipError, RplidarError, DeviceClockError, RecordingError)
+BREAKS = (TransportError, ScipError, RplidarError, DeviceClockError, ScanFileError)
 """Errors that end a session but not the driver."""
 
 OpenSession = Callable[[Host], Session]

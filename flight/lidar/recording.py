@@ -26,7 +26,7 @@ _SCALARS = ("angle_min_rad", "angle_increment_rad", "range_min_m", "range_max_m"
 _ARRAYS = ("time_s", "ranges_m")
 
 
-class RecordingError(ValueError):
+class ScanFileError(ValueError):
     """A recording that cannot be used; the message says what is wrong with it."""
 
 
@@ -49,15 +49,15 @@ def register_reader(suffix: str, reader: ScanReader) -> None:
 
 
 def open_recording(path: Path) -> ScanSource:
-    """The recording in a file, by its suffix. Raises `RecordingError`."""
+    """The recording in a file, by its suffix. Raises `ScanFileError`."""
     reader = READERS.get(path.suffix)
     if reader is None:
-        raise RecordingError(f"{path}: no reader for {path.suffix or 'a file without suffix'}: have {', '.join(sorted(READERS))}")
+        raise ScanFileError(f"{path}: no reader for {path.suffix or 'a file without suffix'}: have {', '.join(sorted(READERS))}")
     return reader(path)
 
 
 class NpzScans:
-    """A file written by `write_npz`. Raises `RecordingError` if it is not one, or larger than is reasonable."""
+    """A file written by `write_npz`. Raises `ScanFileError` if it is not one, or larger than is reasonable."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -65,9 +65,9 @@ class NpzScans:
                 _check_sizes(archive)
                 arrays = {name: np.asarray(archive[name]) for name in (*_ARRAYS, *_SCALARS)}
         except KeyError as error:
-            raise RecordingError(f"{path}: array {error} is missing: not a recording of scans") from None
+            raise ScanFileError(f"{path}: array {error} is missing: not a recording of scans") from None
         except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise RecordingError(f"{path}: cannot be read: {error}") from None
+            raise ScanFileError(f"{path}: cannot be read: {error}") from None
         self._time_s, self._ranges_m, self._geometry = _checked(path, arrays)
 
     def scans(self) -> Iterator[LidarScan]:
@@ -87,28 +87,28 @@ def _checked(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], tuple[float, float, float, float]]:
     time_s, ranges = arrays["time_s"], arrays["ranges_m"]
     if any(arrays[name].dtype.kind not in "fiu" for name in (*_ARRAYS, *_SCALARS)):
-        raise RecordingError(f"{path}: every array must hold numbers")
+        raise ScanFileError(f"{path}: every array must hold numbers")
     if ranges.ndim != 2 or time_s.shape != ranges.shape[:1] or not 1 <= len(time_s) <= MAX_SCANS:
-        raise RecordingError(f"{path}: time_s {time_s.shape} and ranges_m {ranges.shape} do not fit: want [n] and [n, beams]")
+        raise ScanFileError(f"{path}: time_s {time_s.shape} and ranges_m {ranges.shape} do not fit: want [n] and [n, beams]")
     if not 2 <= ranges.shape[1] <= MAX_BEAMS or any(arrays[name].size != 1 for name in _SCALARS):
-        raise RecordingError(f"{path}: want 2..{MAX_BEAMS} beams and one number for each of {', '.join(_SCALARS)}")
+        raise ScanFileError(f"{path}: want 2..{MAX_BEAMS} beams and one number for each of {', '.join(_SCALARS)}")
     times = time_s.astype(np.float64)
     if not np.isfinite(times).all() or not (np.diff(times) > 0.0).all():
-        raise RecordingError(f"{path}: time_s must be finite and increase")
+        raise ScanFileError(f"{path}: time_s must be finite and increase")
     low, step, near, far = (float(arrays[name].reshape(-1)[0]) for name in _SCALARS)
     geometry = (low, step, near, far)
     problem = scan_problem(LidarScan(0.0, ranges[0].astype(np.float32), *geometry))
     if problem is not None:
-        raise RecordingError(f"{path}: the geometry {dict(zip(_SCALARS, geometry, strict=True))} is impossible ({problem})")
+        raise ScanFileError(f"{path}: the geometry {dict(zip(_SCALARS, geometry, strict=True))} is impossible ({problem})")
     return times, ranges.astype(np.float32), geometry
 
 
 def write_npz(path: Path, scans: Iterable[LidarScan]) -> int:
-    """Write scans of one geometry; how many. Raises `RecordingError` when there are none or their geometry changes."""
+    """Write scans of one geometry; how many. Raises `ScanFileError` when there are none or their geometry changes."""
     taken = list(scans)
     geometries = {(scan.ranges_m.size, *(getattr(scan, name) for name in _SCALARS)) for scan in taken}
     if len(geometries) != 1:
-        raise RecordingError(f"a file of scans holds one geometry, these have {len(geometries)}")
+        raise ScanFileError(f"a file of scans holds one geometry, these have {len(geometries)}")
     first, times = taken[0], np.array([scan.time_s for scan in taken])
     np.savez_compressed(
         path,
@@ -170,10 +170,10 @@ class RecordingSession:
 
 
 def recording_session(config: LidarSource, host: Host, source: ScanSource | None = None) -> RecordingSession:
-    """The session for `driver: recording`. Raises `RecordingError`."""
+    """The session for `driver: recording`. Raises `ScanFileError`."""
     if source is None:
         if config.path is None:
-            raise RecordingError("driver recording needs lidar.path")
+            raise ScanFileError("driver recording needs lidar.path")
         source = open_recording(config.path)
     return RecordingSession(source, host)
 

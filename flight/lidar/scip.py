@@ -23,7 +23,6 @@ MAX_REPLY_BYTES = 32 * 1024
 """Longest reply kept while waiting for its end. The longest MD scan of a UST-20LX (1081 steps) is 3.4 kB."""
 
 DATA_LINE_CHARACTERS = 64
-TIMESTAMP_BITS = 24
 STATUS_OK = "00"
 STATUS_STREAM = "99"
 STATUS_UNSTABLE = "0M"

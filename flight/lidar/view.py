@@ -205,7 +205,9 @@ def _source(mission: Path | None, given: dict[str, Any], changes: list[str]) -> 
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "lidar"
-        raise _UsageError(f"{where}: {first['msg']}") from None
+        unknown = first["type"] == "extra_forbidden"
+        what = "unknown key; see docs/lidar.md" if unknown else first["msg"].removeprefix("Value error, ")
+        raise _UsageError(f"{where}: {what}") from None
 
 
 def _value(text: str) -> Any:
@@ -228,7 +230,7 @@ def main() -> None:
     except Exception as error:
         if not hasattr(error, "format_message"):  # typer's usage errors have no public base class
             raise
-        print(f"lidar-view: {error.format_message()} See lidar-view --help.", file=sys.stderr)
+        print(f"lidar-view: {error.format_message().rstrip('.')}; see lidar-view --help", file=sys.stderr)
         code = 2
     sys.exit(int(code or 0))
 

@@ -17,7 +17,8 @@ from sim_gateway.parameters import ParameterStore
 from sim_gateway.piloted import PilotedVehicle
 from sim_gateway.scene import World
 from sim_gateway.simulation import Simulation
-from sim_gateway.telemetry import GROUND, ONBOARD, Message, Telemetry
+from sim_gateway.stream_rates import GROUND, ONBOARD
+from sim_gateway.telemetry import Message, Telemetry
 from sim_gateway.vehicle import STEP_S
 from sim_gateway.vehicle_params import SIH_QUADX
 

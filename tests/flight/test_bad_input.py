@@ -59,6 +59,10 @@ def test_missing_policy_file(stand: Stand) -> None:
     refused(stand.fly(), USAGE, "policy.path", "nowhere.onnx")
 
 
+def test_missing_world_file(stand: Stand) -> None:
+    refused(stand.fly(change=replaced("world.yaml", "nowhere.yaml")), USAGE, "sim.world", "nowhere.yaml")
+
+
 def test_corrupt_policy_file(stand: Stand) -> None:
     content = bytearray(stand.policy.read_bytes())
     content[len(content) // 2] ^= 0xFF

@@ -24,7 +24,7 @@ from flight.lidar.from_link import feed_from_link
 from flight.lidar.inbox import OWNER_TIMEOUT_S, Inbox
 from flight.lidar.obstacle_distance import BODY_FRD, ObstacleDistanceError, decode_obstacle_distance
 from flight.lidar.polar import polar_plot
-from flight.lidar.recording import NpzScans, RecordingError, open_recording, write_npz
+from flight.lidar.recording import NpzScans, ScanFileError, open_recording, write_npz
 from safety.messages import LidarScan
 
 QUICK = {"reply_timeout_s": 0.3, "stall_timeout_s": 0.3, "reconnect_min_s": 0.02, "reconnect_max_s": 0.1}
@@ -274,7 +274,7 @@ def test_a_file_that_is_no_recording_is_refused(tmp_path: Path, damage: str) -> 
         if damage == "missing":
             del arrays["range_max_m"]
         np.savez(path, **arrays)
-    with pytest.raises(RecordingError, match=r"scans\.npz"):
+    with pytest.raises(ScanFileError, match=r"scans\.npz"):
         NpzScans(path)
 
 

@@ -96,6 +96,7 @@ def test_a_number_that_is_not_finite_is_refused_everywhere(tmp_path: Path, bad: 
         ("takeoff_height_m: 2.0", "takeoff_height_m: 3.95", 4, "takeoff_height_m: 3.95 m is outside"),
         ("takeoff_height_m: 2.0", "", 1, "takeoff_height_m: required key is missing"),
         ("udpin://127.0.0.1:14540", "tcp:somewhere", 2, "vehicle.connection"),
+        ("udpin://127.0.0.1:14540", "udpin://127.0.0.1:99999", 2, "1..65535"),
         ("udpin://127.0.0.1:14540", "udpin://127.0.0.1:14540 ; rm", 2, "vehicle.connection"),
         ("max_m: [35.0, 4.0, 4.0]", "max_m: [35.0, -4.0, 4.0]", 8, "fence y"),
         ("min_m: [0.0, -4.0, 0.3]", "min_m: [0.0, -4.0, 3.9]", 7, "fence z: nothing is left of the fence"),

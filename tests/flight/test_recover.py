@@ -176,3 +176,9 @@ def test_replay_takes_a_cut_file_as_it_is(tmp_path: Path, whole: bytes) -> None:
     assert program.finish(60.0) == 0, program.err
     assert json.loads(program.out)["identical"] is True
     assert "fly recover makes it whole" in program.err
+
+
+def test_a_file_cut_in_its_first_chunk_is_no_foreign_file(tmp_path: Path, whole: bytes) -> None:
+    (tmp_path / "flight.mcap").write_bytes(whole[:200])
+    with pytest.raises(RecordingError, match="the file ends within a record, before its first whole chunk"):
+        read_recording(tmp_path / "flight.mcap")

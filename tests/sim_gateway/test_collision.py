@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_gateway.collision import clearance_m, in_contact
+from sim_gateway.collision import clearance_m
 
 UNIT = np.array([[0.0, 0.0, 0.0, 1.0, 1.0, 1.0]])
 coordinates = st.tuples(*[st.floats(-5, 5)] * 3).map(np.array)
@@ -32,11 +32,6 @@ def test_nearest_box_counts_and_no_box_is_infinitely_far():
     boxes = np.vstack([UNIT + 10.0, UNIT])
     assert clearance_m(boxes, np.array([2.0, 0.5, 0.5]), 0.0) == pytest.approx(1.0)
     assert clearance_m(np.empty((0, 6)), np.zeros(3), 0.3) == math.inf
-
-
-def test_contact_at_the_radius():
-    assert in_contact(UNIT, np.array([1.35, 0.5, 0.5]), 0.35 + 1e-9)
-    assert not in_contact(UNIT, np.array([1.36, 0.5, 0.5]), 0.35)
 
 
 @given(position=coordinates, low=coordinates, size=st.tuples(*[st.floats(0.05, 3)] * 3).map(np.array))

@@ -18,10 +18,12 @@ from sim_gateway.link_faults import Garbage
 from sim_gateway.mavlink_links import MemoryLink
 from sim_gateway.mavlink_server import MavlinkServer
 from sim_gateway.piloted import PilotedVehicle
+from sim_gateway.readings import Scan
 from sim_gateway.scene import World, box_row
 from sim_gateway.setpoints import OffboardSetpoint
-from sim_gateway.simulation import Scan, Simulation
-from sim_gateway.telemetry import ONBOARD, Telemetry
+from sim_gateway.simulation import Simulation
+from sim_gateway.stream_rates import ONBOARD
+from sim_gateway.telemetry import Telemetry
 from strict_yaml import ConfigError
 
 WALLS = np.vstack([box_row((5.0, 3.0, 2.0), (20.0, 0.2, 4.0)), box_row((5.0, -2.0, 2.0), (20.0, 0.2, 4.0))])

@@ -194,7 +194,12 @@ def test_follower_and_links_from_the_command_line(world: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("options", "word"), [(["--px4", "tcp:x"], "tcp:4560"), (["--follow", "ftp://127.0.0.1:1"], "udpin://127.0.0.1:14551")]
+    ("options", "word"),
+    [
+        (["--px4", "tcp:x"], "tcp:4560"),
+        (["--follow", "ftp://127.0.0.1:1"], "udpin://127.0.0.1:14551"),
+        (["--serial-lidar", "ld06", "--serial-link", "/no/such/folder/lidar", "--lidar-port", "0"], "/no/such/folder/lidar"),
+    ],
 )
 def test_places_that_cannot_be_opened_are_one_line_and_exit_2(world: Path, options: list[str], word: str) -> None:
     command = [sys.executable, "-m", "sim_gateway", "--world", str(world), *options]
@@ -202,6 +207,10 @@ def test_places_that_cannot_be_opened_are_one_line_and_exit_2(world: Path, optio
     assert done.returncode == 2
     (line,) = done.stderr.strip().splitlines()
     assert word in line
+
+
+def test_without_a_word_it_says_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--world" in _refused(capsys)
 
 
 def test_px4_alone_means_its_usual_port() -> None:
@@ -248,6 +257,14 @@ def test_port_in_use_is_one_line_and_exit_2(world: Path, which: str) -> None:
         (["--no-gps"], "--px4"),
         (["--follow", "udpin://127.0.0.1:14551", "--speed", "2"], "--speed"),
         (["--follow", "udpin://127.0.0.1:14551", "--origin", "1,2"], "--origin"),
+        (["--origin", "1,2,0"], "--follow"),
+        (["--serial-link", "lidar"], "--serial-lidar"),
+        (["--follow", "udpin://127.0.0.1:14551", "--px4"], "choose one"),
+        (["--follow", "udpin://127.0.0.1:14551", "--vehicles", "2"], "--vehicles"),
+        (["--px4", "--link", "udp:14540,delay_ms=5"], "--link"),
+        (["--onboard-port", "14550"], "--gcs-port"),
+        (["--report", "/"], "--report"),
+        (["--report", "/dev/null/truth.json"], "--report"),
     ],
 )
 def test_bad_options_are_one_line_and_exit_2(

@@ -19,8 +19,8 @@ from sim_gateway.gateway import Gateway, GatewayConfig
 from sim_gateway.ld06 import LD06, STL27L, Ld06Device, crc8
 from sim_gateway.obstacle_distance import UNKNOWN, obstacle_distance, sector_distances_cm
 from sim_gateway.pty_port import PtyPort
+from sim_gateway.readings import Scan
 from sim_gateway.serial_lidar import SerialLidar
-from sim_gateway.simulation import Scan
 from sim_gateway.spinning import Shots, SpinConfig, SpinningScanner, millimetres
 
 EXAMPLE = bytes.fromhex("542C6808AB7EE000E4DC00E2D900E5D500E3D300E4D000E9CD00E4CA00E2C700E9C500E5C200E5C000E5BE823A1A50")

@@ -16,12 +16,13 @@ from hypothesis import strategies as st
 from mavlink_bench import Bench, Client
 from pymavlink.dialects.v20 import development as mav
 
-from sim_gateway.autopilot import StatusText
+from sim_gateway.autopilot_output import StatusText
 from sim_gateway.flight_modes import FlightMode, Result
 from sim_gateway.mavlink_links import PortInUseError
 from sim_gateway.mavlink_server import MavlinkServer
 from sim_gateway.newer_messages import NEWER_IDS
-from sim_gateway.telemetry import GROUND, ONBOARD, STREAM_RATES_HZ, Telemetry
+from sim_gateway.stream_rates import GROUND, ONBOARD, STREAM_RATES_HZ
+from sim_gateway.telemetry import Telemetry
 
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
 

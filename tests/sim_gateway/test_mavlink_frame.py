@@ -9,7 +9,7 @@ from mavlink_bench import Bench
 from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.mavlink_frame import FramePacker
-from sim_gateway.telemetry import STREAM_RATES_HZ
+from sim_gateway.stream_rates import STREAM_RATES_HZ
 
 
 def _samples() -> list[object]:
