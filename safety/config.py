@@ -124,6 +124,7 @@ class SafetyConfig(_Frozen):
     fov_margin_rad: NotNegative = Field(0.1, description="this much of each edge of the field of view counts as unseen")
     memory_s: NotNegative = Field(20.0, description="returns and free space that left the field of view are remembered this long")
     memory_hold_s: NotNegative = Field(0.12, description="a return is kept this long although newer scans look past it")
+    fault_hold_s: NotNegative = Field(2.0, description="time until HOLD follows a fault's BRAKE: drift until then stays inside")
     ground_z_m: float = Field(0.0, description="corridor z of the ground; returns this low are the ground, not obstacles")
     monitors: MonitorConfig = Field(MonitorConfig.model_validate({}), description="thresholds of the monitors")
     ground_band_m: NotNegative = Field(0.2, description="height above the ground up to which a tilted beam's return is ground")
@@ -139,18 +140,23 @@ class SafetyConfig(_Frozen):
         return self.velocity_error_m_s * self.delay_s
 
     @property
+    def braked_drift_m(self) -> float:
+        """The same until HOLD takes over from a BRAKE that a fault has made; nothing leads back from the fence before, m."""
+        return self.velocity_error_m_s * max(self.delay_s, self.fault_hold_s)
+
+    @property
     def keep_out_m(self) -> float:
         """Distance the vehicle's centre keeps from an obstacle, before estimate errors are added, m."""
         return self.vehicle_radius_m + self.margin_m
 
     def eroded_fence(self) -> PolygonFence:
         """The fence as the vehicle's centre must keep to it: radius, errors of the estimate and margin taken off by distance."""
-        slack_m = self.position_error_m + self.drift_m + self.margin_m
+        slack_m = self.position_error_m + self.braked_drift_m + self.margin_m
         return polygon_fence(self.fence.polygon, self.fence.exclusion, self.vehicle_radius_m, slack_m)
 
     def keep_in_z(self) -> tuple[float, float]:
         """Lowest and highest z of the vehicle's centre, m."""
-        height = self.vehicle_half_height_m + self.position_error_m + self.drift_m + self.margin_m
+        height = self.vehicle_half_height_m + self.position_error_m + self.braked_drift_m + self.margin_m
         return self.fence.low_m[2] + height, self.fence.high_m[2] - height
 
     def stop_distance_m(self, speed_m_s: float) -> float:
