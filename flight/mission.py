@@ -198,6 +198,16 @@ class Mission(_Section):
             _raise(goal_problem(CorridorVector(*goal.position_m), info.data["safety"]))
         return goal
 
+    @field_validator("failsafe")
+    @classmethod
+    def _brake_is_followed_in_time(cls, failsafe: FailsafeSection, info: ValidationInfo) -> FailsafeSection:
+        longest_s = info.data["safety"].fault_hold_s if "safety" in info.data else math.inf
+        if failsafe.escalation.hold_after_s > longest_s:
+            raise ValueError(
+                f"escalation.hold_after_s is longer than the fence has room for; raise safety.fault_hold_s ({longest_s} s)"
+            )
+        return failsafe
+
     @field_validator("sim")
     @classmethod
     def _sim_is_there(cls, sim: SimSection | None, info: ValidationInfo) -> SimSection | None:

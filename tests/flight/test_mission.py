@@ -102,6 +102,7 @@ def test_a_number_that_is_not_finite_is_refused_everywhere(tmp_path: Path, bad: 
         ("min_m: [0.0, -4.0, 0.3]", "min_m: [0.0, -4.0, 3.9]", 7, "fence z: nothing is left of the fence"),
         ("setpoint_loss_timeout_s: 0.5", "setpoint_loss_timeout_s: 5", 11, "setpoint_loss_timeout_s"),
         ("setpoint_loss_timeout_s: 0.5", "setpoint_loss_action: rtl", 11, "setpoint_loss_action"),
+        ("hold_after_s: 2.0", "hold_after_s: 2.5", 11, r"raise safety\.fault_hold_s"),
         ("[1.0, 0.5, 0.0]", "[14.0, 14.0, 0.0]", 12, "wind"),
         ("seed: 3", "seed: -3", 12, r"sim\.seed"),
         ("heading_deg: 12.5", "heading_deg: compass", 3, r"frame\.heading_deg"),
@@ -161,5 +162,5 @@ def test_require_names_the_first_failed_check() -> None:
 def test_the_example_with_polygons_is_valid_and_its_fence_is_kept() -> None:
     safety = load_mission(ROOT / "configs" / "polygon_fence.yaml").safety
     assert goal_problem(CorridorVector(20.0, 2.0, 2.0), safety) is None
-    assert "outside the safe part of the fence by 0.28 m" in str(goal_problem(CorridorVector(20.0, 3.0, 2.0), safety))
+    assert "outside the safe part of the fence by 0.35 m" in str(goal_problem(CorridorVector(20.0, 3.0, 2.0), safety))
     assert "outside" in str(takeoff_point_problem((12.0, -3.5), safety))

@@ -67,7 +67,7 @@ def test_after_reset_nothing_of_the_last_flight_is_left(ticks):
 def test_outside_one_edge_the_others_hold(out, room, speed):
     """A little beyond the fence on one side, and flown towards another: there it still stops inside."""
     chosen = config(fence=Fence(min_m=(-2.0, -3.0, 0.3), max_m=(8.0, 3.0, 4.0)))
-    inside = 3.0 - chosen.vehicle_radius_m - chosen.position_error_m - chosen.drift_m - chosen.margin_m
+    inside = 3.0 - chosen.vehicle_radius_m - chosen.position_error_m - chosen.braked_drift_m - chosen.margin_m
     safety, plant = SafetyFilter(chosen), Plant(x=5.0 + inside + out, y=inside - room, yaw=math.pi / 2.0)
     for _ in range(60):
         sent, _ = safety.apply(command(0.0, speed), *tick(plant))

@@ -24,7 +24,7 @@ SQUARE = ((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0))
 quick = settings(max_examples=60, deadline=None)
 inside_l = st.tuples(st.floats(0.3, 11.7), st.floats(0.3, 11.7)).filter(lambda p: p[0] < 4.7 or p[1] < 4.7)
 velocity = st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))  # where braking leads outside, two ways out may be as good
-SLACK_M = config().position_error_m + config().drift_m + config().margin_m
+SLACK_M = config().position_error_m + config().braked_drift_m + config().margin_m
 FREE = {"max_acceleration_m_s2": 1000.0, "max_jerk_m_s3": 1000.0, "ground_z_m": -100.0}
 
 
@@ -281,6 +281,6 @@ def test_no_leg_goes_through_a_thin_exclusion():
     """Both ends of the brake tube would be clear of a wall of 1 cm: the way between counts."""
     wall = ((6.0, 1.0), (6.01, 1.0), (6.01, 4.0), (6.0, 4.0))
     small = {"vehicle_radius_m": 0.05, "margin_m": 0.0, "position_error_m": 0.0}
-    sent, verdict = sent_in(polygons(exclusion=(wall,)), (5.9, 2.5), v=(0.1, 0.0), wanted=(1.2, 0.0), **small)
+    sent, verdict = sent_in(polygons(exclusion=(wall,)), (5.8, 2.5), v=(0.1, 0.0), wanted=(1.2, 0.0), **small)
     assert sent[0] < 0.5
     assert verdict.interventions[0].rule == "fence"
