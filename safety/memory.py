@@ -18,7 +18,7 @@ CAPACITY = 2048
 MOVED_S = (
     1.0  # so long a point spreads at the obstacles' speed; after that the unseen that grows into the map of free space holds
 )
-LEAST_DEPTH_M = 0.1  # nothing is taken to be thinner: a pole seen from one side can be drifted upon from the other
+LEAST_DEPTH_M = 0.15  # nothing is taken to be thinner: a pole seen from one side can be drifted upon from the other
 NOTHING_M = 1e6  # in place of the distance where a beam met nothing
 SAME_PLACE_M = 0.2  # a return this close to a remembered one, along its beam, is the same thing seen again
 

@@ -87,7 +87,7 @@ REVIEWED = {
     "loop_monitor.MAX_FOREIGN": 128,
     "loop_monitor.ROUNDING_S": 1e-06,
     "memory.CAPACITY": 2048,
-    "memory.LEAST_DEPTH_M": 0.1,
+    "memory.LEAST_DEPTH_M": 0.15,
     "memory.MOVED_S": 1.0,
     "memory.NOTHING_M": 1000000.0,
     "memory.SAME_PLACE_M": 0.2,
