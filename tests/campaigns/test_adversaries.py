@@ -184,10 +184,15 @@ def test_drift_over_the_fence_beside_an_obstacle_is_led_back():
     assert outcome.fence_m > 0.03
 
 
-@pytest.mark.parametrize("case", ["main/poles/vertical/4", "main/gaps/flipped/5", "main/pillars/bang/6"])
+@pytest.mark.parametrize("case", ["main/poles/vertical/4", "main/poles/reflex/0", "main/gaps/flipped/5", "main/pillars/bang/6"])
 def test_what_was_passed_is_not_drifted_upon(case):
     """Seen with one error of the estimate, met with the opposite one, from the side that was never seen."""
     assert not run_case(Case.parse(case)).outcome.events
+
+
+def test_braking_for_a_fault_does_not_drift_over_the_fence_before_hold():
+    """Nothing within range is no scan: it braked above the floor for 2 s, the velocity estimate wrong by its bound."""
+    assert not run_case(Case.parse("main/convex/search/0")).outcome.events
 
 
 def test_the_way_out_of_a_margin_grows_no_faster_than_the_limits():

@@ -61,7 +61,7 @@ def tour(places, hold: int = 50):
 def test_aiming_at_every_corner_with_the_estimate_off_by_its_bound(name, error):
     run = Run(name, tour(corners(name)), 50 * len(corners(name)), error)
     run.assert_inside()
-    assert run.margin < 0.25  # it does get near: the fence is usable space
+    assert run.margin < 0.35  # it does get near: the fence is usable space
     assert run.way_m > 5.0
 
 

@@ -104,8 +104,8 @@ def test_an_evading_command_keeps_to_the_limits():
 
 def test_the_fence_is_eroded_by_the_drift_of_a_velocity_error():
     one, two = CONFIG, config(velocity_error_m_s=0.1)
-    assert two.keep_in_z()[0] - one.keep_in_z()[0] == pytest.approx(0.05 * one.delay_s)
-    assert two.eroded_fence().edges.erosion_m[0] - one.eroded_fence().edges.erosion_m[0] == pytest.approx(0.05 * one.delay_s)
+    assert two.keep_in_z()[0] - one.keep_in_z()[0] == pytest.approx(0.05 * one.fault_hold_s)
+    assert two.eroded_fence().edges.erosion_m[0] - one.eroded_fence().edges.erosion_m[0] == pytest.approx(0.05 * one.fault_hold_s)
 
 
 @given(angles)
