@@ -44,7 +44,7 @@ def train(
     resume: Annotated[Path | None, typer.Option(help="Go on with the run in this folder, from its last.pt.")] = None,
     start_from: Annotated[Path | None, typer.Option(help="Checkpoint whose weights a new run begins with.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Replaces the preset's seed.")] = None,
-    decisions: Annotated[float | None, typer.Option(min=1, help="Replaces the preset's number of decisions.")] = None,
+    decisions: Annotated[float | None, typer.Option(min=1, max=1e12, help="Replaces the preset's number of decisions.")] = None,
     memory: Annotated[str | None, typer.Option(help="Replaces the preset's memory: lstm, gru, stack or none.")] = None,
     device: Annotated[str, typer.Option(help="Torch device of the network.")] = "cpu",
     threads: Annotated[int, typer.Option(min=1, help="Torch threads; more than 1 rarely helps at this size.")] = 1,
@@ -135,6 +135,8 @@ def _settings(config: Path | None, out: Path | None, resume: Path | None, change
 
     if config is not None:
         base, folder = load_config(config, TrainingConfig), out or Path("runs") / config.stem
+        if folder.exists() and not folder.is_dir():
+            raise _UsageError(f"{folder} is a file; give --out a folder")
         if (folder / "last.pt").exists():
             raise _UsageError(f"{folder} already holds a run: go on with --resume {folder}, or give another --out")
     else:

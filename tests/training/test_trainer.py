@@ -313,6 +313,7 @@ def test_command_says_that_training_diverged(tmp_path):
         ([], "either --config"),
         (["--config", "absent.yaml"], "absent.yaml: cannot be read"),
         (["--resume", "nowhere"], "no such checkpoint"),
+        (["--config", str(ROOT / "configs" / "training" / "ppo.yaml"), "--out", __file__], "is a file; give --out a folder"),
         (["--resume", "run", "--start-from", "other.pt"], "--start-from belongs to a new run"),
     ],
 )
