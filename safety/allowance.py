@@ -195,8 +195,11 @@ def _fence_hold_off_m_s(depth_m: Floats, config: SafetyConfig) -> Floats:
 
 
 def _fence_due_m_s(ways: WaysOut, config: SafetyConfig) -> Floats:
-    """Least part of a command along each way out of the fence's margin: back where drift led in, else as far as there is room."""
-    depth = -ways.room_m - SLIDE_SHARE * config.margin_m
+    """Least part of a command along each way out of the fence's margin: back where drift led in, else as far as there is room.
+
+    What is kept for a fault's drift is not pressed for: an obstacle on the other side counts for more.
+    """
+    depth = -ways.room_m - SLIDE_SHARE * config.margin_m - config.fault_room_m
     return np.where(depth > 0.0, _fence_hold_off_m_s(depth, config), -np.maximum(ways.room_m, 0.0) / stop_gain_s(config))
 
 

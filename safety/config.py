@@ -145,6 +145,11 @@ class SafetyConfig(_Frozen):
         return self.velocity_error_m_s * max(self.delay_s, self.fault_hold_s)
 
     @property
+    def fault_room_m(self) -> float:
+        """What of that is kept for a fault alone: no command enters it, and without a fault drift into it need not be led out, m."""
+        return self.braked_drift_m - self.drift_m
+
+    @property
     def keep_out_m(self) -> float:
         """Distance the vehicle's centre keeps from an obstacle, before estimate errors are added, m."""
         return self.vehicle_radius_m + self.margin_m

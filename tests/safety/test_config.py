@@ -92,6 +92,7 @@ def test_keep_in_takes_radius_margin_and_error_off():
     c = config(fence=Fence(min_m=(0, -4, 0), max_m=(10, 4, 3)), vehicle_radius_m=0.3, margin_m=0.1, position_error_m=0.05)
     assert c.drift_m == pytest.approx(0.05 * 0.85)
     assert c.braked_drift_m == pytest.approx(0.05 * 2.0)
+    assert c.fault_room_m == pytest.approx(0.05 * 1.15)
     assert config(fault_hold_s=0.5).braked_drift_m == c.drift_m
     assert c.keep_in_z() == pytest.approx((0.35, 2.65))
     assert c.eroded_fence().room_m([(0.55, 0.0), (9.45, 3.45), (5.0, 0.0)]) == pytest.approx([0.0, 0.0, 3.45])

@@ -280,7 +280,7 @@ def test_there_is_a_way_out_of_an_exclusion():
 def test_no_leg_goes_through_a_thin_exclusion():
     """Both ends of the brake tube would be clear of a wall of 1 cm: the way between counts."""
     wall = ((6.0, 1.0), (6.01, 1.0), (6.01, 4.0), (6.0, 4.0))
-    small = {"vehicle_radius_m": 0.05, "margin_m": 0.0, "position_error_m": 0.0}
-    sent, verdict = sent_in(polygons(exclusion=(wall,)), (5.8, 2.5), v=(0.1, 0.0), wanted=(1.2, 0.0), **small)
+    small = {"vehicle_radius_m": 0.05, "margin_m": 0.0, "position_error_m": 0.0, "fault_hold_s": 0.0}
+    sent, verdict = sent_in(polygons(exclusion=(wall,)), (5.9, 2.5), v=(0.1, 0.0), wanted=(1.2, 0.0), **small)
     assert sent[0] < 0.5
     assert verdict.interventions[0].rule == "fence"

@@ -213,7 +213,7 @@ def test_mirrored_world_gives_the_mirrored_command(boxes, ux, uy, vx, vy):
     here, _ = once(command(ux, uy), state(x=XC, y=YC, v=(vx, vy, 0)), view(boxes, XC, YC, centre=(XC, YC)))
     there, _ = once(command(ux, -uy), state(x=XC, y=YC, v=(vx, -vy, 0)), view(mirrored, XC, YC, centre=(XC, YC)))
     # the map has no middle row of cells, and a direction on the border of two sectors counts in the other one when mirrored
-    assert away(command(ux, uy), here) == pytest.approx(away(command(ux, -uy), there), abs=3e-2)
+    assert away(command(ux, uy), here) == pytest.approx(away(command(ux, -uy), there), abs=5e-2)
 
 
 @given(boxes_around, st.sampled_from([1, 2, 3]), speed, speed, st.floats(-0.8, 0.8))
