@@ -190,6 +190,11 @@ def test_what_was_passed_is_not_drifted_upon(case):
     assert not run_case(Case.parse(case)).outcome.events
 
 
+def test_between_fence_and_pillar_it_is_not_pressed_upon_the_pillar():
+    """A way of 0.95 m: the room kept for a fault's drift was held at the cost of a contact."""
+    assert not run_case(Case.parse("main/pillars/reflex/7")).outcome.events
+
+
 def test_braking_for_a_fault_does_not_drift_over_the_fence_before_hold():
     """Nothing within range is no scan: it braked above the floor for 2 s, the velocity estimate wrong by its bound."""
     assert not run_case(Case.parse("main/convex/search/0")).outcome.events
