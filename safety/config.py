@@ -146,7 +146,7 @@ class SafetyConfig(_Frozen):
 
     @property
     def fault_room_m(self) -> float:
-        """What of that is kept for a fault alone: no command enters it, and without a fault drift into it need not be led out, m."""
+        """What of that is kept for a fault alone: no command enters it, but drift into it need not be led out, m."""
         return self.braked_drift_m - self.drift_m
 
     @property

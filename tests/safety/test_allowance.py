@@ -10,8 +10,12 @@ import pytest
 from safety_plant import config
 
 from safety.allowance import Allowance, _fence_due_m_s, _outward, _strongest_per_sector, _way_out_m_s, allowance, held_in
-from safety.braking import Tubes, stop_gain_s
+from safety.braking import Start, Tubes, stop_gain_s
 from safety.fence_tube import WaysOut
+from safety.frames import CorridorVector
+from safety.free_space import FreeSpace
+from safety.shield import Shield, Surroundings
+from safety.sight import View
 
 MARGIN, KEEP_OUT, HOLD_OFF, SLIDE, POINT_BAND, FENCE_BAND = 0.08, 0.43, 0.25, 0.02, 0.05, 0.5
 C = config(margin_m=MARGIN, vehicle_radius_m=KEEP_OUT - MARGIN, hold_off_speed_m_s=HOLD_OFF)
@@ -103,6 +107,17 @@ def test_vertical_bounds_reach_floor_and_ceiling_and_lead_back(room):
     assert (high.sink_m_s, high.climb_m_s) == pytest.approx((-0.1 / GAIN, bound))
 
 
+def test_a_point_beside_the_way_counts_with_the_errors_up_to_there():
+    """Half way along a leg of 2 m: half of what the velocity error adds along it, and all of what it added before."""
+    tube = Tubes(np.zeros((2, 1, 3)), np.broadcast_to((2.0, 0.0, 0.0), (2, 1, 3)))
+    x, y, extra = np.array([1.0]), np.array([0.6]), np.array([0.01])
+    empty = View(FreeSpace(C), np.array((x, y)), 0.0)
+    at_rest = Start(np.zeros((2, 3)), np.zeros((2, 3)))
+    around = Surroundings(x, y, extra, empty, CorridorVector(0.0, 0.0, 0.0), at_rest)
+    errors_m = C.velocity_error_m_s * (C.dead_time_s + C.tick_s + 0.5 * C.lag_s)
+    assert Shield(C)._tube_clearances(tube, around)[0, 0] == pytest.approx(0.6 - 0.01 - errors_m - KEEP_OUT)
+
+
 def ways(chance, count):
     bearings = [chance.uniform(-math.pi, math.pi) for _ in range(count)]
     normals = np.array([(math.cos(b), math.sin(b)) for b in bearings]).reshape(-1, 2).T
@@ -110,7 +125,7 @@ def ways(chance, count):
 
 
 def fence_due(room):
-    depth = -room - SLIDE
+    depth = -room - SLIDE - C.velocity_error_m_s * (C.fault_hold_s - C.delay_s)
     return fence_hold_off(depth) if depth > 0.0 else -max(room, 0.0) / GAIN
 
 

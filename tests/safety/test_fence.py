@@ -277,6 +277,12 @@ def test_there_is_a_way_out_of_an_exclusion():
     assert verdict.fence_margin_m == pytest.approx(-0.1 - 0.35 - SLACK_M)
 
 
+def test_the_way_back_into_the_fence_is_slow():
+    sent, verdict = sent_in(polygons(), (-0.1, 6.0), wanted=(1.0, 0.0))
+    assert 0.1 < sent[0] <= 0.3
+    assert verdict.interventions[0].rule == "return_speed"
+
+
 def test_no_leg_goes_through_a_thin_exclusion():
     """Both ends of the brake tube would be clear of a wall of 1 cm: the way between counts."""
     wall = ((6.0, 1.0), (6.01, 1.0), (6.01, 4.0), (6.0, 4.0))
