@@ -150,5 +150,6 @@ def _or_inf(value: float | None) -> float:
 def section(report: dict[str, Any]) -> str:
     """The campaign as docs/safety.md shows it."""
     main = report["blocks"][MAIN]
-    total = f"`{report['command']}`: {main['ticks']:,} ticks of 0.05 s in {main['flights']:,} cases"
+    ended = ", stopped before its end" if report.get("partial") else ""
+    total = f"`{report['command']}`{ended}: {main['ticks']:,} ticks of 0.05 s in {main['flights']:,} cases"
     return f"{total}, {_none_in(main) if not main['events'] else main['events']} violations.\n\n{markdown(report)}"
