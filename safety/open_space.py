@@ -46,7 +46,7 @@ class TubeBox:
         (left, below, _), (right, above, _) = self.low_m, self.high_m
         dx = np.minimum(np.maximum(x_m, left), right) - x_m
         dy = np.minimum(np.maximum(y_m, below), above) - y_m
-        return not np.count_nonzero(dx * dx + dy * dy <= kept_m * kept_m)
+        return bool(np.count_nonzero(dx * dx + dy * dy > kept_m * kept_m) == x_m.shape[0])  # what is not a number is not apart
 
     def inside(self, position: CorridorVector, room: Room, climb_m: float) -> bool:
         """Whether no place of the box is further from the vehicle than its room to the fence, sideways and upright.

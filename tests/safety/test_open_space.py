@@ -132,3 +132,11 @@ def test_what_is_kept_is_hull_margin_and_all_errors():
     assert kept_to_points_m(resting(), moving) == pytest.approx(still_m + 0.5 * (0.25 + slow_s) + 1e-6, abs=1e-12)
     for up in (-0.3, 0.3):
         assert climb_room_m(CorridorVector(1.0, 1.0, up), c) == pytest.approx(0.3 * stop_gain_s(c) + 1e-6, abs=1e-12)
+
+
+def test_a_place_that_is_not_a_number_is_not_apart():
+    box = TubeBox((0.0, 0.0, 1.0), (1.0, 1.0, 2.0))
+    far, kept_m = np.array([9.0, 9.0]), np.array([1.0, 1.0])
+    assert box.apart_from(far, far, kept_m)
+    assert not box.apart_from(np.array([9.0, np.nan]), far, kept_m)
+    assert not box.apart_from(far, far, np.array([1.0, np.nan]))
