@@ -86,6 +86,8 @@ class _Watch:
     """What is noted while flying: from the truth, which the stack never sees."""
 
     least_distance_m: float = math.inf
+    task_done: tuple[float, float] | None = None
+    """Vehicle time, s, and metres flown when the goal's radius was first reached."""
     first_contact: str | None = None
     left_fence: bool = False
     diverged: bool = False
@@ -173,6 +175,8 @@ class LockstepFlight:
         truth, watch = self.simulation.truth, self._watch
         watch.least_distance_m = min(watch.least_distance_m, math.dist(truth.position_m, self.world.goal))
         watch.velocities.append(truth.velocity_m_s)
+        if watch.task_done is None and watch.least_distance_m <= SUCCESS_RADIUS_M:
+            watch.task_done = self.simulation.time_s, self.simulation.flown_m
         if self.simulation.contacts and watch.first_contact is None:
             boxes, fixed = self.simulation.boxes(), len(self.world.static_boxes)
             watch.first_contact = what_was_hit(boxes, fixed, truth.position_m, self.simulation.contact_radius_m)
@@ -185,6 +189,8 @@ class LockstepFlight:
         failure = "diverged" if watch.diverged else watch.first_contact or ("fence" if watch.left_fence else None)
         if failure is None and not success:
             failure = "missed_goal" if math.isfinite(reached_s) else "timeout"
+        # the task ends at the goal's radius: what lies inside it, the stack's own arrival and braking, counts in neither path
+        duration_s, flown_m = watch.task_done or (min(reached_s, ticks * TICK_S), simulation.flown_m)
         start = (*self.world.start[:2], self.config.takeoff_height_m)
         shortest_m = shortest_path_length(self.world.static_boxes, start, self.world.goal, simulation.contact_radius_m)
         return EpisodeResult(
@@ -194,9 +200,8 @@ class LockstepFlight:
             contacts=simulation.contacts,
             failure=failure,
             ticks=ticks,
-            duration_s=min(reached_s, ticks * TICK_S),
-            path_length_m=simulation.flown_m,
-            # the last metres inside the goal's radius need not be flown
+            duration_s=duration_s,
+            path_length_m=flown_m,
             shortest_path_m=max(0.0, shortest_m - SUCCESS_RADIUS_M),
             min_clearance_m=simulation.min_clearance_m,
             mean_jerk_m_s3=mean_jerk(np.array(watch.velocities)),

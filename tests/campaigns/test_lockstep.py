@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from campaigns.evaluate import Campaign, report, run_campaign
-from campaigns.lockstep import LockstepFlight, StackConfig, mean_jerk
+from campaigns.lockstep import BRAKE_AFTER_GOAL_S, TICK_S, LockstepFlight, StackConfig, mean_jerk
 from campaigns.splits import Split, load_split
 from flight.mission import load_mission
 from flight.trajectory import write_trajectory_csv
@@ -62,6 +62,14 @@ def test_an_unseen_corridor_is_flown_cleanly() -> None:
     assert result.failure is None
     assert 0.8 < result.path_efficiency <= 1.0
     assert result.duration_s < 60.0
+
+
+def test_the_path_ends_at_the_goals_radius_as_the_task_does() -> None:
+    flight = LockstepFlight(generate_corridor(2_000_000), STACK)
+    result = flight.run()
+    assert result.success
+    assert result.duration_s <= result.ticks * TICK_S - BRAKE_AFTER_GOAL_S, "the braking after arrival counts"
+    assert flight.simulation.flown_m - 1.0 < result.path_length_m < flight.simulation.flown_m - 0.05
 
 
 def test_a_wall_across_is_not_touched_and_counts_as_timeout() -> None:
