@@ -22,9 +22,12 @@ from campaigns.strength import strength
 from policy_export.errors import PolicyError
 from policy_export.policy_file import PolicyFile, read_policy_file
 from sim_gateway.faults import KINDS, Kind
+from strict_yaml import load_config
+from training.config import EnvironmentConfig, TrainingConfig
 
 RESULTS = Path("results")
 POLICIES = Path("policies")
+PRESETS = Path("configs/training")
 README = Path("README.md")
 SAFETY = Path("docs/safety.md")
 BEGIN, END = "<!-- results -->", "<!-- end of results -->"
@@ -105,6 +108,7 @@ def model_card(file: PolicyFile, path: Path, results: dict[str, dict[str, Any]])
     """The card of one policy, from its own metadata and the results measured on exactly these weights."""
     meta, training = file.metadata, file.metadata.training
     details, action = training.details, meta.action
+    preset = PRESETS / f"{path.stem.removeprefix('corridor_')}.yaml"
     minutes = float(str(details.get("seconds", 0.0))) / 60.0
     limits = ", ".join(
         f"{name} {low:g}..{high:g}"
@@ -113,8 +117,8 @@ def model_card(file: PolicyFile, path: Path, results: dict[str, dict[str, Any]])
     verification = f"{meta.verification.max_abs_difference:.1e}" if meta.verification else "not verified"
     facts = [
         ("file", f"`{path.name}`, {path.stat().st_size} bytes, SHA-256 `{file.sha256}`"),
-        ("command", f"`train-policy --config configs/training/{details.get('preset', 'ppo_lstm')}.yaml --out runs/ppo_lstm`"),
-        ("then", f"`export-policy runs/ppo_lstm/best.pt -o {path}`"),
+        ("command", f"`train-policy --config {preset} --out runs/{preset.stem}`"),
+        ("then", f"`export-policy runs/{preset.stem}/best.pt -o {path}`"),
         ("seed, commit, configuration", f"{training.seed}, `{training.git_commit}`, `{training.config_hash}`"),
         ("decisions at this checkpoint", f"{training.steps:,}"),
         ("training time to this checkpoint", f"{minutes:.0f} min on one core of a shared two-core machine"),
@@ -129,15 +133,23 @@ def model_card(file: PolicyFile, path: Path, results: dict[str, dict[str, Any]])
         "",
     ]
     lines += ["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in facts), ""]
-    lines += ["## Results", "", table(lockstep_rows(results, meta.weights_sha256)), "", _LIMITS]
+    lines += ["## Results", "", table(lockstep_rows(results, meta.weights_sha256)), "", trained_on(load_config(preset, TrainingConfig).environment)]
     return "\n".join(lines)
 
 
-_LIMITS = """## Trained on, and not on
-Corridors of 35 x 8 m with 4 to 12 fixed square pillars, altitude 1.5 to 3 m, an Iris-class vehicle with randomised mass, drag,
-motors and gains, estimate errors of nominal size (a share of episodes up to those recorded on PX4's simplest simulator), 0 to 2 %
-lost beams, up to 1.5 m/s of wind. Never on moving obstacles, never outdoors, never on a real LiDAR. It must fly behind a safety
-layer.
+def trained_on(environment: EnvironmentConfig) -> str:
+    """What the weights have seen and what they have not, for the card."""
+    (least, most), share = environment.pillars, environment.moving_share
+    pillars, never = f"{least} to {most} fixed square pillars", "Never on moving obstacles, never outdoors"
+    if share:
+        low, high = environment.moving_pillars
+        pillars += f", in {100 * share:.0f} % of the corridors {low} to {high} more that move at up to {environment.mover_speed_max_mps:g} m/s"
+        never = "Never on people or animals, never outdoors"
+    return f"""## Trained on, and not on
+Corridors of 35 x 8 m with {pillars}; altitude 1.5 to 3 m, an Iris-class vehicle with
+randomised mass, drag, motors and gains, estimate errors of nominal size ({100 * environment.estimate.harsh_share:.0f} % of episodes up to
+those recorded on PX4's simplest simulator), 0 to {100 * environment.dropout[1]:g} % lost beams, up to {environment.vehicle.wind_mps[1]:g} m/s of wind.
+{never}, never on a real LiDAR. It must fly behind a safety layer.
 """
 
 

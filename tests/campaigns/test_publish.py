@@ -8,13 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from campaigns.publish import lockstep_rows, publish, read_results
+from campaigns.publish import lockstep_rows, publish, read_results, trained_on
+from training.config import EnvironmentConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_readme_and_model_cards_are_what_the_results_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for folder in ("policies", "results", "docs"):
+    for folder in ("policies", "results", "docs", "configs"):
         shutil.copytree(ROOT / folder, tmp_path / folder)
     shutil.copy(ROOT / "README.md", tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -45,3 +46,11 @@ def test_every_shipped_policy_has_a_card_with_results() -> None:
     for path in policies:
         assert path.stat().st_size < 1_000_000
         assert "clean success" in path.with_suffix(".md").read_text(), f"no result was measured on {path.name}"
+
+
+def test_a_card_says_whether_anything_moved_in_training() -> None:
+    assert "Never on moving obstacles" in trained_on(EnvironmentConfig())
+    moving = trained_on(EnvironmentConfig(moving_share=0.25, mover_speed_max_mps=0.6))
+    assert "in 25 % of the corridors" in moving
+    assert "up to 0.6 m/s" in moving
+    assert "Never on moving obstacles" not in moving
