@@ -133,22 +133,25 @@ def model_card(file: PolicyFile, path: Path, results: dict[str, dict[str, Any]])
         "",
     ]
     lines += ["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in facts), ""]
-    lines += ["## Results", "", table(lockstep_rows(results, meta.weights_sha256)), "", trained_on(load_config(preset, TrainingConfig).environment)]
-    return "\n".join(lines)
+    lines += ["## Results", "", table(lockstep_rows(results, meta.weights_sha256)), ""]
+    return "\n".join([*lines, trained_on(load_config(preset, TrainingConfig).environment)])
 
 
 def trained_on(environment: EnvironmentConfig) -> str:
     """What the weights have seen and what they have not, for the card."""
     (least, most), share = environment.pillars, environment.moving_share
-    pillars, never = f"{least} to {most} fixed square pillars", "Never on moving obstacles, never outdoors"
+    moving, never = "", "Never on moving obstacles, never outdoors"
     if share:
         low, high = environment.moving_pillars
-        pillars += f", in {100 * share:.0f} % of the corridors {low} to {high} more that move at up to {environment.mover_speed_max_mps:g} m/s"
+        moving = (
+            f", in {share:.0%} of the corridors {low} to {high} more that move at up to {environment.mover_speed_max_mps:g} m/s"
+        )
         never = "Never on people or animals, never outdoors"
+    harsh, lost, wind_m_s = environment.estimate.harsh_share, environment.dropout[1], environment.vehicle.wind_mps[1]
     return f"""## Trained on, and not on
-Corridors of 35 x 8 m with {pillars}; altitude 1.5 to 3 m, an Iris-class vehicle with
-randomised mass, drag, motors and gains, estimate errors of nominal size ({100 * environment.estimate.harsh_share:.0f} % of episodes up to
-those recorded on PX4's simplest simulator), 0 to {100 * environment.dropout[1]:g} % lost beams, up to {environment.vehicle.wind_mps[1]:g} m/s of wind.
+Corridors of 35 x 8 m with {least} to {most} fixed square pillars{moving}.
+Altitude 1.5 to 3 m, an Iris-class vehicle with randomised mass, drag, motors and gains, estimate errors of nominal size (in
+{harsh:.0%} of the episodes up to those recorded on PX4's simplest simulator), 0 to {lost:.0%} lost beams, up to {wind_m_s:g} m/s of wind.
 {never}, never on a real LiDAR. It must fly behind a safety layer.
 """
 

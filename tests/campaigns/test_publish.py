@@ -51,6 +51,6 @@ def test_every_shipped_policy_has_a_card_with_results() -> None:
 def test_a_card_says_whether_anything_moved_in_training() -> None:
     assert "Never on moving obstacles" in trained_on(EnvironmentConfig())
     moving = trained_on(EnvironmentConfig(moving_share=0.25, mover_speed_max_mps=0.6))
-    assert "in 25 % of the corridors" in moving
+    assert "in 25% of the corridors" in moving
     assert "up to 0.6 m/s" in moving
     assert "Never on moving obstacles" not in moving
