@@ -151,7 +151,8 @@ def trained_on(environment: EnvironmentConfig) -> str:
     return f"""## Trained on, and not on
 Corridors of 35 x 8 m with {least} to {most} fixed square pillars{moving}.
 Altitude 1.5 to 3 m, an Iris-class vehicle with randomised mass, drag, motors and gains, estimate errors of nominal size (in
-{harsh:.0%} of the episodes up to those recorded on PX4's simplest simulator), 0 to {lost:.0%} lost beams, up to {wind_m_s:g} m/s of wind.
+{harsh:.0%} of the episodes up to those recorded on PX4's simplest simulator), 0 to {lost:.0%} lost beams, up to
+{wind_m_s:g} m/s of wind.
 {never}, never on a real LiDAR. It must fly behind a safety layer.
 """
 
