@@ -11,7 +11,8 @@ import numpy as np
 from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.faults import LINK, Active, FaultSchedule
-from sim_gateway.telemetry import Message
+from sim_gateway.mavlink_frame import FramePacker
+from sim_gateway.telemetry import COMPONENT_ID, SYSTEM_ID, Message
 
 _KEPT = 50_000
 _FLOOD_PER_CALL = 500
@@ -19,10 +20,18 @@ _FOREIGN_BOOT_MS = 5_000_000  # the second vehicle has been on for longer
 
 
 @dataclass(frozen=True, slots=True)
-class Garbage:
-    """Bytes that are no message."""
+class RawBytes:
+    """Bytes for the wire as they are, a message or not."""
 
     data: bytes
+
+
+def _flood_frames() -> list[RawBytes]:
+    packer, text = FramePacker(SYSTEM_ID, COMPONENT_ID), mav.MAVLink_statustext_message(6, b"flood")
+    return [RawBytes(packer.pack(text)) for _ in range(256)]
+
+
+_FLOOD = _flood_frames()  # packed once: the flood is the client's to bear, vehicle time must not stand still for it
 
 
 class LinkFaults:
@@ -39,7 +48,7 @@ class LinkFaults:
         """What a message from the vehicle becomes now."""
         return self._pass("out", message, now_s, self._schedule.group(LINK, now_s)) if self._schedule.has(LINK) else [message]
 
-    def due_out(self, now_s: float) -> list[Message | Garbage]:
+    def due_out(self, now_s: float) -> list[Message | RawBytes]:
         """Messages from the vehicle whose delay is over, and what faults add by themselves."""
         if not self._schedule.has(LINK):
             return []
@@ -88,7 +97,7 @@ class LinkFaults:
             due.append(heapq.heappop(late)[2])
         return due
 
-    def _made(self, item: Active, now_s: float) -> list[Message | Garbage]:
+    def _made(self, item: Active, now_s: float) -> list[Message | RawBytes]:
         """Messages that a fault makes up, at its own rate since the last call."""
         make = _MAKERS.get(item.kind)
         if make is None:
@@ -101,15 +110,15 @@ class LinkFaults:
         return make(self._generator, now_s, number)
 
 
-def _garbage(generator: np.random.Generator, _now_s: float, number: int) -> list[Message | Garbage]:
-    return [Garbage(b"\xfd" + generator.bytes(int(generator.integers(1, 280)))) for _ in range(number)]
+def _garbage(generator: np.random.Generator, _now_s: float, number: int) -> list[Message | RawBytes]:
+    return [RawBytes(b"\xfd" + generator.bytes(int(generator.integers(1, 280)))) for _ in range(number)]
 
 
-def _flood(_generator: np.random.Generator, _now_s: float, number: int) -> list[Message | Garbage]:
-    return [mav.MAVLink_statustext_message(6, b"flood")] * number
+def _flood(_generator: np.random.Generator, _now_s: float, number: int) -> list[Message | RawBytes]:
+    return [_FLOOD[k % len(_FLOOD)] for k in range(number)]
 
 
-def _foreign(_generator: np.random.Generator, now_s: float, number: int) -> list[Message | Garbage]:
+def _foreign(_generator: np.random.Generator, now_s: float, number: int) -> list[Message | RawBytes]:
     """Position, attitude and heartbeat of a disarmed vehicle far away that uses the same system id."""
     boot_ms = _FOREIGN_BOOT_MS + round(1e3 * now_s)
     place = mav.MAVLink_local_position_ned_message(boot_ms, 150.0, -80.0, 0.0, 0.0, 0.0, 0.0)
@@ -118,7 +127,7 @@ def _foreign(_generator: np.random.Generator, now_s: float, number: int) -> list
     return [place, attitude, beat][: 3 * number]
 
 
-_MAKERS: dict[str, Callable[[np.random.Generator, float, int], list[Message | Garbage]]] = {
+_MAKERS: dict[str, Callable[[np.random.Generator, float, int], list[Message | RawBytes]]] = {
     "link_garbage": _garbage,
     "link_flood": _flood,
     "link_foreign": _foreign,

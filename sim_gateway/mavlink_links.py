@@ -19,7 +19,7 @@ from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.autopilot_output import StatusText
 from sim_gateway.link_conditions import LinkConditions
-from sim_gateway.link_faults import Garbage, LinkFaults
+from sim_gateway.link_faults import LinkFaults, RawBytes
 from sim_gateway.link_spec import LOOPBACK
 from sim_gateway.mavlink_frame import FramePacker
 from sim_gateway.stream_rates import STREAM_RATES_HZ
@@ -102,7 +102,7 @@ class MavlinkLink(ABC):
         for leaving in self.faults.out(message, self._now_s()):
             self._convey(leaving)
 
-    def _convey(self, message: Message | Garbage) -> None:
+    def _convey(self, message: Message | RawBytes) -> None:
         if self.conditions is None:
             self._transmit(message)
             return
@@ -119,7 +119,7 @@ class MavlinkLink(ABC):
                 self._transmit(leaving)
 
     @abstractmethod
-    def _transmit(self, message: Message | Garbage) -> None:
+    def _transmit(self, message: Message | RawBytes) -> None:
         """Put one message on the wire."""
 
     def send_text(self, text: StatusText) -> None:
@@ -210,10 +210,10 @@ class UdpLink(MavlinkLink):
         """Free the port."""
         self.socket.close()
 
-    def _transmit(self, message: Message | Garbage) -> None:
+    def _transmit(self, message: Message | RawBytes) -> None:
         """To all peers; a full or unreachable socket loses the message, as UDP does."""
         try:
-            data = message.data if isinstance(message, Garbage) else self._packer.pack(message)
+            data = message.data if isinstance(message, RawBytes) else self._packer.pack(message)
         except (struct.error, OverflowError, ValueError) as error:
             _log.error("message %s has a value outside its field: %s", type(message).__name__, error)
             return
@@ -262,10 +262,10 @@ class MemoryLink(MavlinkLink):
 
     def __init__(self, name: str, column: int, now_s: Callable[[], float]) -> None:
         super().__init__(name, column, now_s)
-        self.outbox: deque[Message | Garbage] = deque(maxlen=_MEMORY_MESSAGES)
+        self.outbox: deque[Message | RawBytes] = deque(maxlen=_MEMORY_MESSAGES)
         self.inbox: deque[Message] = deque(maxlen=_MEMORY_MESSAGES)
 
-    def _transmit(self, message: Message | Garbage) -> None:
+    def _transmit(self, message: Message | RawBytes) -> None:
         self.outbox.append(message)
 
     def _fetch(self) -> list[Message]:

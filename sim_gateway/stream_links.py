@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from sim_gateway.frame_reader import FrameReader, decode
-from sim_gateway.link_faults import Garbage
+from sim_gateway.link_faults import RawBytes
 from sim_gateway.mavlink_frame import FramePacker
 from sim_gateway.mavlink_links import MavlinkLink, PortInUseError
 from sim_gateway.serial_port import LineGoneError, PacedReader, PacedWriter
@@ -33,9 +33,9 @@ class _StreamLink(MavlinkLink):
         super().__init__(name, column, now_s)
         self._packer = FramePacker(system_id, COMPONENT_ID)
 
-    def _transmit(self, message: Message | Garbage) -> None:
+    def _transmit(self, message: Message | RawBytes) -> None:
         try:
-            data = message.data if isinstance(message, Garbage) else self._packer.pack(message)
+            data = message.data if isinstance(message, RawBytes) else self._packer.pack(message)
         except (struct.error, OverflowError, ValueError) as error:
             _log.error("message %s has a value outside its field: %s", type(message).__name__, error)
             return

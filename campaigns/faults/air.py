@@ -15,7 +15,7 @@ from sim_gateway.faults import Fault
 from sim_gateway.flight_modes import FlightMode
 from sim_gateway.gateway import connect_faults
 from sim_gateway.lidar import LidarConfig
-from sim_gateway.link_faults import Garbage
+from sim_gateway.link_faults import RawBytes
 from sim_gateway.mavlink_links import MemoryLink
 from sim_gateway.mavlink_server import MavlinkServer
 from sim_gateway.parameters import ParameterStore
@@ -123,5 +123,5 @@ class Air:
                 self.setpoints.append(Setpoint(item.time_s, (north, east, down), yaw_rate, item.sender[1]))
         while self.link.outbox:
             message = self.link.outbox.popleft()
-            if isinstance(message, Garbage) or message.get_type() in STREAMED or message.get_type() == "COMMAND_ACK":
+            if isinstance(message, RawBytes) or message.get_type() in STREAMED or message.get_type() == "COMMAND_ACK":
                 self.downlink.append((self.time_s + DOWNLINK_S, message))

@@ -25,7 +25,7 @@ from flight.lidar.scip_session import ScipSession
 from flight.lidar.session import Host
 from flight.link import VehicleLink
 from safety.messages import LidarScan
-from sim_gateway.link_faults import Garbage
+from sim_gateway.link_faults import RawBytes
 from sim_gateway.vehicle import STEP_S
 
 CLOCK_OFFSET_S = 1000.0
@@ -86,7 +86,7 @@ class Computer:
         downlink = self.air.downlink
         while not self.frozen and downlink and downlink[0][0] <= self.air.time_s:
             message = downlink.popleft()[1]
-            if isinstance(message, Garbage):
+            if isinstance(message, RawBytes):
                 self.on_message("LOCAL_POSITION_NED", 1, message.data.decode("latin-1"))
             else:
                 self._note(message.get_type())

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from pymavlink.dialects.v20 import development as mav
 
 from sim_gateway.faults import KINDS, Fault, FaultError, load_faults
 from sim_gateway.flight_modes import FlightMode
 from sim_gateway.gateway import connect_faults
 from sim_gateway.lidar import LidarConfig
-from sim_gateway.link_faults import Garbage
+from sim_gateway.link_faults import RawBytes
 from sim_gateway.mavlink_links import MemoryLink
 from sim_gateway.mavlink_server import MavlinkServer
 from sim_gateway.piloted import PilotedVehicle
@@ -71,7 +72,7 @@ class Rig:
         return self
 
     def named(self, name: str, since_s: float = BEGIN_S) -> list[tuple[float, Any]]:
-        kept = [(t, m) for t, m in self.messages if t >= since_s and not isinstance(m, Garbage)]
+        kept = [(t, m) for t, m in self.messages if t >= since_s and not isinstance(m, RawBytes)]
         return [(t, m) for t, m in kept if m.get_type() == name]
 
     def newest(self) -> Scan:
@@ -158,7 +159,7 @@ def test_every_kind_runs_and_does_something() -> None:
         rig = Rig(*faults).offboard(0.3, 0.1, 0.0)
         rig.run(1.2)
         scans = b"".join(scan.ranges_m.tobytes() + np.float64(scan.time_s).tobytes() for _, scan in rig.scans)
-        told = "".join(repr((t, m.data if isinstance(m, Garbage) else m.to_dict())) for t, m in rig.messages)
+        told = "".join(repr((t, m.data if isinstance(m, RawBytes) else m.to_dict())) for t, m in rig.messages)
         return scans + told.encode() + rig.vehicle.simulation.state_row.tobytes()
 
     quiet = trace()
@@ -278,9 +279,13 @@ def test_link_faults() -> None:
     assert all(t - m.time_boot_ms * 1e-3 == pytest.approx(0.3, abs=0.01) for t, m in heard("link_delay"))
     times = [m.time_boot_ms for _, m in heard("link_reorder")]
     assert times != sorted(times)
-    garbage = [m for _, m in Rig(fault("link_garbage")).run(2.0).messages if isinstance(m, Garbage)]
+    garbage = [m for _, m in Rig(fault("link_garbage")).run(2.0).messages if isinstance(m, RawBytes)]
     assert 40 <= len(garbage) <= 60
-    assert len(Rig(fault("link_flood", 0.5)).run(1.5).named("STATUSTEXT")) == pytest.approx(5000, rel=0.05)
+    flood = [m for _, m in Rig(fault("link_flood", 0.5)).run(1.5).messages if isinstance(m, RawBytes)]
+    assert len(flood) == pytest.approx(5000, rel=0.05)
+    texts = mav.MAVLink(None).parse_buffer(b"".join(m.data for m in flood))
+    assert {m.text for m in texts} == {"flood"}
+    assert len(texts) == len(flood), "every one is a valid message"
 
 
 def test_uplink_loss_ends_in_the_loss_action() -> None:
