@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,8 @@ from safety.config import SafetyConfig
 from sim_gateway.simulation import WindConfig
 
 TRAINING = "training"
+TELL_EVERY_S = 30.0
+"""How often a log file, not a screen, is told of progress."""
 _runners: dict[bytes | Path, PolicyRunner] = {}
 
 
@@ -83,10 +86,14 @@ def run_campaign(
     with _progress() as progress:
         bar = progress.add_task("flying", total=episodes, clean=0, done=0)
         results: dict[int, EpisodeResult] = {}
+        told_s = time.monotonic()
         for index, result in arriving:
             results[index] = result
-            clean = sum(r.clean_success for r in results.values())
-            progress.update(bar, advance=1, clean=f"{100 * clean / len(results):.1f}")
+            clean = f"{100 * sum(r.clean_success for r in results.values()) / len(results):.1f}"
+            progress.update(bar, advance=1, clean=clean)
+            if not progress.console.is_terminal and time.monotonic() - told_s > TELL_EVERY_S:  # a bar is for a screen
+                told_s = time.monotonic()
+                progress.console.print(f"{len(results)} of {episodes} flown, clean {clean} %", highlight=False)
     return [results[i] for i in range(episodes)]
 
 

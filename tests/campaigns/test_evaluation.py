@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from campaigns import cli
+from campaigns import cli, evaluate
 from campaigns.errors import ClusterError
 from campaigns.evaluate import Campaign, report, run_campaign
 from campaigns.evaluation_report import markdown, replay_command
@@ -138,6 +138,13 @@ def test_a_replayed_failure_is_the_same_flight(tmp_path):
     assert two["episodes"][1] == again["episodes"][0]
     assert two["dynamics"] == "training"
     assert "mean jerk" in files[0].with_suffix(".md").read_text()
+
+
+def test_a_log_file_is_told_of_progress(monkeypatch, capsys):
+    monkeypatch.setattr(evaluate, "TELL_EVERY_S", 0.0)
+    campaign = Campaign(MISSION.policy.path, SPLITS["unseen"], MISSION.safety, dynamics="training")
+    run_campaign(campaign, 1, workers=1)
+    assert "1 of 1 flown, clean 100.0 %" in capsys.readouterr().err
 
 
 def squared(number):
