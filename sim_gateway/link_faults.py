@@ -16,6 +16,7 @@ from sim_gateway.telemetry import COMPONENT_ID, SYSTEM_ID, Message
 
 _KEPT = 50_000
 _FLOOD_PER_CALL = 500
+_FLOOD_PER_DATAGRAM = 20
 _FOREIGN_BOOT_MS = 5_000_000  # the second vehicle has been on for longer
 
 
@@ -26,12 +27,12 @@ class RawBytes:
     data: bytes
 
 
-def _flood_frames() -> list[RawBytes]:
+def _flood_frames() -> list[bytes]:
     packer, text = FramePacker(SYSTEM_ID, COMPONENT_ID), mav.MAVLink_statustext_message(6, b"flood")
-    return [RawBytes(packer.pack(text)) for _ in range(256)]
+    return [packer.pack(text) for _ in range(_FLOOD_PER_CALL)]
 
 
-_FLOOD = _flood_frames()  # packed once: the flood is the client's to bear, vehicle time must not stand still for it
+_FLOOD = _flood_frames()  # packed once, and sent many at a time: it is the client's to bear, vehicle time must not stand still
 
 
 class LinkFaults:
@@ -115,7 +116,7 @@ def _garbage(generator: np.random.Generator, _now_s: float, number: int) -> list
 
 
 def _flood(_generator: np.random.Generator, _now_s: float, number: int) -> list[Message | RawBytes]:
-    return [_FLOOD[k % len(_FLOOD)] for k in range(number)]
+    return [RawBytes(b"".join(_FLOOD[k : min(k + _FLOOD_PER_DATAGRAM, number)])) for k in range(0, number, _FLOOD_PER_DATAGRAM)]
 
 
 def _foreign(_generator: np.random.Generator, now_s: float, number: int) -> list[Message | RawBytes]:

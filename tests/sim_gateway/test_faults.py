@@ -282,10 +282,9 @@ def test_link_faults() -> None:
     garbage = [m for _, m in Rig(fault("link_garbage")).run(2.0).messages if isinstance(m, RawBytes)]
     assert 40 <= len(garbage) <= 60
     flood = [m for _, m in Rig(fault("link_flood", 0.5)).run(1.5).messages if isinstance(m, RawBytes)]
-    assert len(flood) == pytest.approx(5000, rel=0.05)
     texts = mav.MAVLink(None).parse_buffer(b"".join(m.data for m in flood))
+    assert len(texts) == pytest.approx(5000, rel=0.05)
     assert {m.text for m in texts} == {"flood"}
-    assert len(texts) == len(flood), "every one is a valid message"
 
 
 def test_uplink_loss_ends_in_the_loss_action() -> None:
