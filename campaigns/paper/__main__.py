@@ -60,7 +60,7 @@ def write_study(runs: list[Run], chosen: argparse.Namespace, splits: dict[str, S
     volume = f" --decisions {chosen.decisions:g}" if chosen.decisions else ""
     command = (
         f"python -m campaigns.paper --ppo {chosen.ppo} --lstm {chosen.lstm} --seeds {chosen.seeds}{volume} "
-        f"--episodes {chosen.episodes} --out {out}"
+        f"--episodes {chosen.episodes} --runs {chosen.runs} --out {out}"
     )
     write_json(out / TABLE, table | {"command": command})
     (out / "README.md").write_text(markdown(table, command), encoding="utf-8")
