@@ -52,6 +52,14 @@ def show(mutant: Mutant, verdict: Verdict) -> None:
         print(f"{verdict.outcome} ({verdict.seconds:.0f} s) {where}\n  - {verdict.before}\n  + {verdict.after}", flush=True)
 
 
+def command_of(chosen: argparse.Namespace) -> str:
+    """The command line, as far as it decides the result."""
+    modules = "".join(f" --module {path}" for path in chosen.module or ())
+    sample = f" --sample {chosen.sample}" if chosen.sample else ""
+    budget = f" --budget-s {chosen.budget_s:g}" if math.isfinite(chosen.budget_s) else ""
+    return f"python -m campaigns.mutation{modules}{sample}{budget} --out results/mutation.json"
+
+
 def main() -> int:
     """Run what has no verdict yet; 0 when every mutant is killed or proved equivalent."""
     chosen, root, begin = options(), Path.cwd(), time.monotonic()
@@ -80,7 +88,7 @@ def main() -> int:
         "properties": len(properties(root)),
         "examples_per_property": EXAMPLES,
         "seconds": time.monotonic() - begin,
-        "command": "python -m campaigns.mutation --out results/mutation.json",
+        "command": command_of(chosen),
     }
     if chosen.list:
         for one in (s for s in result["survivors"] if not s["proof"]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator
 
+from campaigns.mutation.__main__ import command_of
 from campaigns.mutation.forks import Job, run_forked
 from campaigns.mutation.hotswap import module_name
 from campaigns.mutation.hunt import judged
@@ -162,6 +164,13 @@ def test_figures_count_what_is_explained():
     assert (result["killed"], result["survived"], result["proved_equivalent"], result["unexplained"]) == (1, 2, 1, 1)
     assert result["not_run"] == 1
     assert [s["proof"] for s in result["survivors"]] == ["because", None]
+
+
+def test_the_command_names_what_decides_the_result():
+    everything = types.SimpleNamespace(module=None, sample=None, budget_s=math.inf)
+    assert command_of(everything) == "python -m campaigns.mutation --out results/mutation.json"
+    sample = types.SimpleNamespace(module=["safety/caps.py"], sample=12, budget_s=20.0)
+    assert "--module safety/caps.py --sample 12 --budget-s 20 --out" in command_of(sample)
 
 
 def test_a_mutant_is_found_by_the_real_tests():
