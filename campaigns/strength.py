@@ -6,12 +6,14 @@ from typing import Any
 
 
 def strength(results: dict[str, dict[str, Any]]) -> str:
-    """Markdown of the mutation score, the accidents and the comparison with cosmic-ray's own runs, as far as they are there."""
+    """Markdown of the mutation score, its comparison with cosmic-ray's own runs, accidents and oracle, as far as they are there."""
     parts = [mutation(results["mutation"])] if "mutation" in results else []
     if "mutation_crosscheck" in results:
         parts.append(crosscheck(results["mutation_crosscheck"]))
     if "accidents" in results:
         parts.append(accidents(results["accidents"]))
+    if "fence_oracle" in results:
+        parts.append(fence_oracle(results["fence_oracle"]))
     return "\n\n".join(parts)
 
 
@@ -44,6 +46,15 @@ def crosscheck(result: dict[str, Any]) -> str:
     return (
         f"`{result['command']}`: of {result['mutants']} mutants chosen at random ({result['survivors']} of them survivors), "
         f"`cosmic-ray exec`, one process each and all tests in full, judged {result['agreed']} the same."
+    )
+
+
+def fence_oracle(result: dict[str, Any]) -> str:
+    """The fence beside exact fractions and shapely."""
+    return (
+        f"`python tests/safety/fence_oracle.py --cases {result['cases']}`: {result['cases']:,} random places and ways over "
+        f"{result['fences']:,} fences ({result['concave or with exclusions']:,} concave or with exclusions) judged by exact fractions "
+        f"and shapely {result['shapely']} too: {result['disagreements']} disagreements."
     )
 
 
