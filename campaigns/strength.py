@@ -6,7 +6,7 @@ from typing import Any
 
 
 def strength(results: dict[str, dict[str, Any]]) -> str:
-    """Markdown of the mutation score, its comparison with cosmic-ray's own runs, accidents and oracle, as far as they are there."""
+    """Markdown of mutation score, comparison with cosmic-ray's own runs, accidents and oracle, as far as they are there."""
     parts = [mutation(results["mutation"])] if "mutation" in results else []
     if "mutation_crosscheck" in results:
         parts.append(crosscheck(results["mutation_crosscheck"]))
@@ -53,8 +53,8 @@ def fence_oracle(result: dict[str, Any]) -> str:
     """The fence beside exact fractions and shapely."""
     return (
         f"`python tests/safety/fence_oracle.py --cases {result['cases']}`: {result['cases']:,} random places and ways over "
-        f"{result['fences']:,} fences ({result['concave or with exclusions']:,} concave or with exclusions) judged by exact fractions "
-        f"and shapely {result['shapely']} too: {result['disagreements']} disagreements."
+        f"{result['fences']:,} fences ({result['concave or with exclusions']:,} concave or with exclusions) judged by exact "
+        f"fractions and shapely {result['shapely']} too: {result['disagreements']} disagreements."
     )
 
 
