@@ -68,7 +68,7 @@ def lockstep_rows(results: dict[str, dict[str, Any]], weights: str | None = None
         n, split, safety = result["clean_success"]["n"], result["split"], "on" if result["safety"] else "off"
         dynamics = result["dynamics"]
         how, option = ("lockstep", "") if dynamics == "internal" else (f"{dynamics} dynamics", f" --dynamics {dynamics}")
-        what = f"clean success, `{split}`, safety {safety}, {how}: {result['description']}"
+        what = f"`{Path(result['policy']).stem}`: clean success, `{split}`, safety {safety}, {how}: {result['description']}"
         figure = f"{rate(result['clean_success'])}; path efficiency {result['path_efficiency']:.3f}"
         if result["clean_arrival"]["rate"] != result["clean_success"]["rate"]:
             figure += f"; arrived cleanly by its own estimate: {rate(result['clean_arrival'])}"
