@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from safety_plant import config, scan, state
+from safety_plant import command, config, scan, state
 
-from safety.lidar import BeamTable, clean_ranges, scan_problem, see
+from safety.filter import SafetyFilter
+from safety.lidar import BeamTable, _unseen, clean_ranges, scan_problem, see
 from safety.memory import CAPACITY, LEAST_DEPTH_M, SAME_PLACE_M, ObstacleMemory, _edges
 from safety.messages import LidarScan
 
@@ -110,6 +111,27 @@ def test_tilted_beam_that_meets_the_ground_is_unknown(roll, pitch, beam, low):
     assert found.x_m.shape[0] == (0 if low else 1)
 
 
+@given(st.lists(st.booleans(), min_size=1, max_size=60), st.sampled_from([0.3, 0.1, 0.05, math.pi / 180]))
+def test_a_bearing_is_unseen_where_more_than_a_fifth_of_the_beams_around_it_are_unknown(lost, increment_rad):
+    """Within 0.26 rad on either side, one beam at least; at the edges of the view only what there is counts."""
+    half = max(1, math.floor(0.26 / increment_rad))
+    around = [lost[max(i - half, 0) : i + half + 1] for i in range(len(lost))]
+    wanted = [5 * sum(window) > len(window) for window in around]
+    found = _unseen(np.where(lost, np.nan, 1.0), increment_rad)
+    assert (found.tolist() if found is not None else [False] * len(lost)) == wanted
+
+
+@pytest.mark.parametrize(("beams", "increment_rad"), [(3, math.pi / 2), (7, math.pi / 4), (180, math.pi / 180)])
+def test_a_view_that_lacks_a_whole_beam_has_edges(beams, increment_rad):
+    def all_round(step_rad):
+        pose = state()
+        return see(LidarScan(0.0, np.full(beams, 2.0), -1.0, step_rad, 0.1, 4.0), pose, BeamTable(), C).all_round
+
+    assert not all_round(increment_rad)
+    assert all_round(2.0 * math.pi / beams)
+    assert all_round(2.0 * math.pi / (beams + 0.9))
+
+
 def test_tilt_shortens_the_horizontal_distance():
     found = seen(one_return(90, 2.0), state(z=3.0, pitch=-0.3))
     assert found.x_m[0] - 5.0 == pytest.approx(2.0 * math.cos(0.3), abs=1e-3)
@@ -135,6 +157,7 @@ def test_the_far_side_of_an_edge_is_kept_along_its_beam():
 
 
 @given(st.lists(st.sampled_from([1.0, 1.1, 1.5, 3.0, math.inf, math.nan]), min_size=2, max_size=12))
+@example([0.4, 0.2, 0.4])  # exactly as much further as the same thing may be
 def test_a_return_is_at_an_edge_when_a_beam_beside_it_saw_clearly_further(values):
     def further(i, j):
         return 0 <= j < len(values) and values[j] - values[i] > SAME_PLACE_M
@@ -186,6 +209,14 @@ def test_far_points_are_dropped():
     fed(memory, one_return(90, 3.0), 0.0)
     memory.update(seen(None, state(x=-5.0), 0.05), 5.0, C)
     assert memory.count == 0
+
+
+@pytest.mark.parametrize(("range_m", "points"), [(4.29, WITH_FAR_SIDE), (4.31, 0)])
+def test_the_filter_remembers_what_a_stop_from_twice_the_speed_limit_could_reach_and_a_little_more(range_m, points):
+    """From 2.4 m/s it takes 0.6 m in the dead time and 1.8 m to brake; then 0.4 m of keep-out and 1.5 m: 4.3 m in all."""
+    safety = SafetyFilter(C)
+    safety.apply(command(), state(), scan(one_return(90, range_m), range_max=8.0), 0.0)
+    assert safety._memory.count == points
 
 
 def test_age_widens_a_point_up_to_its_bounds():

@@ -80,6 +80,11 @@ def test_a_turn_of_the_growth_is_limited_beside_the_way_and_beyond_its_end():
     assert beyond[1] / beyond[0] == pytest.approx(0.5)
 
 
+def test_a_growth_too_small_to_be_squared_counts_as_none():
+    tiny = v(1e-170, 1e-170, 1e-170)
+    assert limited((0.8, 0.1, -0.2), LastSent(v(), tiny))[0] == pytest.approx(limited((0.8, 0.1, -0.2), AT_REST)[0], rel=1e-12)
+
+
 @given(vector, vector, vector, st.floats(1.0, 300.0), st.floats(1.0, 15.0))
 @settings(max_examples=300, deadline=None)
 def test_growth_never_jumps_by_more_than_the_jerk(wanted, last, growth, jerk, acceleration):
