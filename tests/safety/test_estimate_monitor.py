@@ -243,6 +243,18 @@ def test_a_frozen_estimate_stays_one_when_nothing_is_commanded_any_more():
     assert faults == [[]] * 5 + [["estimate_frozen"]] * 15 + [[]] * 10
 
 
+def test_a_microsecond_of_rounding_is_forgiven():
+    """From time zero on, so that every difference is exact: the last sample just completes the window, or just does not."""
+    rate = 2.0 * C.velocity_mismatch_m_s
+    for short_s, is_told in ((1e-6, True), (2e-6, False)):
+        last_s = C.velocity_window_s - short_s
+        drift = [state(5.0 + rate * t, time_s=t) for t in (0.0, 0.1, 0.2, 0.3, last_s)]
+        assert (rules(drift)[-1] == ["velocity_mismatch"]) == is_told
+    for long_s, is_told in ((1e-6, False), (2e-6, True)):
+        still = [state(v=(0.2, 0, 0), time_s=t) for t in (0.0, 0.1, C.frozen_state_s + long_s)]
+        assert (rules(still, commanded=0.5)[-1] == ["estimate_frozen"]) == is_told
+
+
 @pytest.mark.parametrize("changed", ["position", "velocity"])
 @pytest.mark.parametrize("axis", "xyz")
 def test_one_bit_of_position_or_velocity_is_enough_to_be_alive(changed, axis):

@@ -56,6 +56,7 @@ def test_third_bad_command_within_a_second():
     """P1: three in exactly one second are too many; slower ones are not."""
     assert bad([8.0, 8.5, 9.0, 9.5]) == [False, False, True, True]
     assert bad([8.0, 8.5, 9.0001, 9.51]) == [False, False, False, False]
+    assert bad([0.6, 1.2, 1.7, 1.9]) == [False, False, False, True]  # soon after the clock began, too
 
 
 @pytest.mark.parametrize(
@@ -75,17 +76,26 @@ def test_saturation_is_told_after_two_seconds(full):
     assert not any(notices([full] * 31 + [command(0.5)] + [full] * 31))
 
 
+@pytest.mark.parametrize(("short_s", "is_told"), [(1e-6, True), (2e-6, False)])
+def test_saturation_forgives_a_microsecond_of_rounding(short_s, is_told):
+    monitor, told = PolicyMonitor(CONFIG), []
+    for now_s in (0.0, C.saturated_s - short_s):
+        monitor.judge(command(1.2), now_s, told)
+    assert bool(told) == is_told
+
+
 def test_cruising_is_not_saturation():
     assert not any(notices([command(1.1, 0.3, 0.4, 0.9)] * 100))
 
 
-@pytest.mark.parametrize("limit_rad_s", [0.5, 2.0])
-def test_a_yaw_rate_is_full_from_99_percent_of_its_own_limit_on(limit_rad_s):
-    chosen = config(max_yaw_rate_rad_s=limit_rad_s)
-    for share, full in ((0.991, True), (-0.991, True), (0.989, False), (-0.989, False)):
+@pytest.mark.parametrize("limit", [0.5, 2.0])
+@pytest.mark.parametrize("channel", range(4))
+def test_each_channel_is_full_from_99_percent_of_its_own_limit_on(channel, limit):
+    chosen = config(max_horizontal_speed_m_s=limit, max_vertical_speed_m_s=limit, max_yaw_rate_rad_s=limit)
+    for share, full in ((0.99, True), (-0.99, True), (0.989, False), (-0.989, False)):
         monitor, told = PolicyMonitor(chosen), []
         for k in range(40):
-            monitor.judge(command(0.2, 0, 0, share * limit_rad_s), 8.0 + k * TICK, told)
+            monitor.judge(command(*(share * limit * (i == channel) for i in range(4))), 0.6 + k * TICK, told)
         assert bool(told) == full
 
 
