@@ -12,7 +12,7 @@ from safety_plant import command, config
 
 from safety.config import speed_cap_m_s
 from safety.frames import CorridorVector
-from safety.limits import AT_REST, LastSent, limit_command, sent_after
+from safety.limits import AT_REST, LastSent, limit_command, sent_after, within_limits
 
 DT_S = 0.05
 part = st.floats(-0.8, 0.8)  # below the speed limit, which would come first
@@ -78,6 +78,44 @@ def test_a_turn_of_the_growth_is_limited_beside_the_way_and_beyond_its_end():
     beyond, _ = limited((0.6, 0.3), LastSent(v(), v(4.0)), max_jerk_m_s3=100.0)
     assert np.linalg.norm(beyond - (0.2, 0.0, 0.0)) == pytest.approx(0.25)
     assert beyond[1] / beyond[0] == pytest.approx(0.5)
+
+
+def slack_m_s(wanted, last, dt_s, c):
+    """By how much a command keeps to its tightest limit, negative where it breaks it."""
+    wanted, old, growth = (np.array((p.x, p.y, p.z)) for p in (wanted, last.velocity, last.acceleration))
+    added = wanted - min(max(wanted @ old / max(old @ old, 1e-300), 0.0), 1.0) * old
+    return min(
+        c.max_horizontal_speed_m_s - math.hypot(wanted[0], wanted[1]),
+        c.max_vertical_speed_m_s - abs(wanted[2]),
+        c.max_acceleration_m_s2 * dt_s - float(np.linalg.norm(added)),
+        c.max_jerk_m_s3 * dt_s * dt_s - distance_to_way(added, growth * dt_s),
+    )
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_what_evades_keeps_to_the_very_limits_of_what_is_wanted(seed):
+    """Candidates at every distance from their tightest limit, each judged by itself."""
+    random = np.random.default_rng(seed)
+    c = config(max_acceleration_m_s2=float(random.choice([2.0, 10.0])), max_jerk_m_s3=float(random.choice([30.0, 150.0])))
+    last = LastSent(v(*random.uniform(-0.6, 0.6, 3)), v(*(random.choice([0.0, 8.0]) * random.uniform(-1, 1, 3))))
+    dt_s = float(random.choice([0.05, 0.1]))
+    velocities = [v(*(random.choice([0.3, 0.7, 1.3]) * random.uniform(-1, 1, 3))) for _ in range(60)]
+    slack = np.array([slack_m_s(one, last, dt_s, c) for one in velocities])
+    found = within_limits(np.array([(one.x, one.y, one.z) for one in velocities]), last, dt_s, c)
+    clear = np.abs(slack) > 1e-6
+    assert found[clear].tolist() == (slack > 0.0)[clear].tolist()
+
+
+def test_limits_met_exactly_by_what_evades_are_kept():
+    """A billionth of slack for what is computed; none for climbing, which is compared as it is."""
+    wide = config(max_horizontal_speed_m_s=4.0, max_acceleration_m_s2=8.0, max_jerk_m_s3=1000.0)
+    jerky = config(max_horizontal_speed_m_s=4.0, max_acceleration_m_s2=900.0, max_jerk_m_s3=32.0)
+    free = config(max_horizontal_speed_m_s=4.0, max_acceleration_m_s2=900.0, max_jerk_m_s3=1000.0)
+    for chosen, speed_m_s in ((wide, 2.0 + 1e-9), (jerky, 2.0 + 1e-9), (free, 4.0 + 1e-9)):
+        at_limit = np.array([(speed_m_s, 0, 0), (math.nextafter(speed_m_s, 9.0), 0, 0), (0, -speed_m_s, 0)])
+        assert within_limits(at_limit, AT_REST, 0.25, chosen).tolist() == [True, False, True]
+    climbs = np.array([(0, 0, 0.5), (0, 0, -0.5), (0, 0, math.nextafter(0.5, 1.0)), (0, 0, math.nextafter(-0.5, -1.0))])
+    assert within_limits(climbs, AT_REST, 0.25, free).tolist() == [True, True, False, False]
 
 
 def test_a_growth_too_small_to_be_squared_counts_as_none():

@@ -79,8 +79,8 @@ BEAMS, STEP_RAD = 9, 0.25
 STEEP = MonitorConfig(mirror_turn_rad=STEP_RAD)
 
 
-def votes(changes, time_step_s=0.125, monitors=STEEP):
-    """Votes told at each scan of a slope of 0.25 m a beam, turning left by a beam per scan; `changes` of all ranges, m.
+def votes(changes, time_step_s=0.125, monitors=STEEP, turn_beams=1.0):
+    """Votes told at each scan of a slope of 0.25 m a beam, turning left by `turn_beams` a scan; `changes` of all ranges, m.
 
     Turning left things move to the right, so by rights every range grows by 0.25 m; mirrored it falls by as much.
     """
@@ -89,7 +89,7 @@ def votes(changes, time_step_s=0.125, monitors=STEEP):
         offset_m += change_m
         one = LidarScan(k * time_step_s, offset_m + 0.25 * np.arange(BEAMS), -1.0, STEP_RAD, 0.1, 40.0)
         found = []
-        monitor.judge(one, state(yaw=STEP_RAD * k, time_s=k * time_step_s), found)
+        monitor.judge(one, state(yaw=turn_beams * STEP_RAD * k, time_s=k * time_step_s), found)
         result.append(found[0].value if found else 0.0)
     return result[1:]
 
@@ -101,6 +101,13 @@ def test_each_clear_comparison_is_a_vote_and_what_fits_the_right_way_as_well_tak
     assert votes([mirrored] * 3 + [either] + [mirrored] * 4) == [0.0] * 7 + [4.0]
     assert votes([mirrored] * 3 + [weak] + [mirrored]) == [0.0] * 4 + [4.0]  # better mirrored, but not by enough: undecided
     assert votes([right] * 8) == votes([either] * 8) == votes([weak] * 8) == [0.0] * 8
+
+
+def test_a_turn_is_compared_to_the_nearest_beam():
+    """A fall of 0.1875 m fits a mirrored turn by one beam well enough, one by two not."""
+    assert votes([-0.1875] * 4, turn_beams=1.4)[-1] == 4.0
+    assert not any(votes([-0.1875] * 6, turn_beams=1.6))
+    assert votes([-0.5] * 4, turn_beams=1.6)[-1] == 4.0
 
 
 def test_a_reference_is_compared_for_exactly_a_second():
@@ -207,6 +214,25 @@ def test_another_geometry_in_flight_is_another_sender():
     assert numbered([0, 0, 0, 0], mixed) == [[], [], ["scan_source"], []]
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"ranges_m": np.full(181, 2.0)},
+        {"ranges_m": np.full(179, 2.0)},
+        {"angle_min_rad": 0.01},
+        {"angle_min_rad": -3.0},
+        {"angle_increment_rad": 0.02},
+        {"angle_increment_rad": 0.01},
+    ],
+)
+def test_any_change_of_the_geometry_either_way_is_told_once(change):
+    monitor, found = ScanMonitor(CONFIG), []
+    for k in range(6):
+        one = scan(np.full(180, 2.0), k * 0.0625)
+        monitor.judge(dataclasses.replace(one, **change) if k >= 3 else one, state(time_s=one.time_s), found)
+        assert [item.rule for item in found] == ["scan_source"] * (k >= 3)
+
+
 def test_a_scan_seen_before_is_not_judged_again():
     monitor, found = ScanMonitor(CONFIG), []
     one = scan(np.full(180, 2.0), 1.0, sequence=7)
@@ -281,6 +307,11 @@ def test_each_beam_has_its_own_time_and_motion():
     near = [{5}] * 4 + [{5, 80}] * 3 + [{80, 81}] + [{5, 80, 81}] * 12
     expected = [0] * 13 + [1] * 3 + [2] + [3] * 3
     assert masked_counts(near, (1.0, 0.0, 0.0)) == expected
+
+
+def test_motion_is_summed_from_zero_so_that_the_least_counts():
+    least = config(monitors=MonitorConfig(mask_motion_m=1e-18))
+    assert masked_counts([{90}] * 12, (1e-16, 0.0, 0.0), 0.0, least) == [0] * 9 + [1] * 3
 
 
 def test_motion_before_a_return_came_is_not_counted():

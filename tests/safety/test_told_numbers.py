@@ -12,6 +12,7 @@ from safety_plant import command, config, scan, state
 from safety.braking import CommandHistory
 from safety.estimate_monitor import EstimateMonitor
 from safety.frames import CorridorVector
+from safety.limits import AT_REST, LastSent, limit_command
 from safety.loop_monitor import LoopMonitor
 from safety.messages import Health, Intervention
 from safety.policy_monitor import PolicyMonitor
@@ -114,6 +115,25 @@ def test_a_foreign_setpoint_is_told_by_its_distance_from_the_nearest_of_ours():
         history.add(8.0 + k * TICK_S, ours)
     foreign = [Health(echo=CorridorVector(0.8, 0.3, -0.4), echo_time_s=8.0 + k * TICK_S) for k in range(20)]
     assert of_loop(foreign, history) == [("foreign_setpoint", pytest.approx(0.5), C.echo_error_m_s)]
+
+
+def of_limits(wanted, last=AT_REST, **changes):
+    return told(limit_command(wanted, last, 0.05, 4.0, config(**changes))[1])
+
+
+def test_limits_tell_what_was_wanted_and_what_is_allowed():
+    free = {"max_acceleration_m_s2": 900.0, "max_jerk_m_s3": 1000.0}
+    allowed_m_s = pytest.approx(limit_command(command(1.2), AT_REST, 0.05, 4.0, config(**free))[0].velocity.x)
+    assert of_limits(command(3.0, -4.0), **free)[:1] == [("speed_limit", 5.0, allowed_m_s)]
+    assert of_limits(command(0.0, 0.0, -0.75, -1.5), **free) == [
+        ("vertical_speed_limit", 0.75, 0.5),
+        ("yaw_rate_limit", 1.5, 1.0),
+    ]
+    grown = of_limits(
+        command(0.6, 0.8), LastSent(CorridorVector(0.3, 0.4, 0.0), CorridorVector(0.0, 0.0, 0.0)), max_acceleration_m_s2=4.0
+    )
+    assert grown == [("acceleration_limit", pytest.approx(0.5), pytest.approx(0.2))]
+    assert of_limits(command(0.48, 0.0), max_jerk_m_s3=80.0) == [("jerk_limit", pytest.approx(0.48), pytest.approx(0.2))]
 
 
 def test_scans_tell_numbers_votes_and_masked_beams():
