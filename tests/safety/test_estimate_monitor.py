@@ -82,6 +82,7 @@ def test_reset_counter():
         return [dataclasses.replace(s, reset_counter=c) for s, c in zip(cruise(len(values)), values, strict=True)]
 
     assert rules(counted([3, 3, 4, 4, 3])) == [[], [], ["estimate_reset"], [], ["estimate_reset"]]
+    assert not any(rules(counted([int("1000"), int("1000")])))  # equal, though not one object
     assert rules(counted([255, 0])) == [[], ["estimate_reset"]]
     assert not any(rules(counted([None, 3, 3, None, 4])))
 
@@ -194,6 +195,33 @@ def test_a_step_of_exactly_the_limit_is_accepted():
     for shift in ((limit, 0, 0), (0, -limit, 0), (0, 0, limit), (0, 0, -limit)):
         pair = [state(4.0, 0.0, 2.0), state(4.0 + shift[0], shift[1], 2.0 + shift[2], time_s=STEP)]
         assert not any(rules(pair, config=exact))
+
+
+def test_the_window_begins_with_the_newest_sample_that_makes_it_long_enough():
+    """A sample at the very time from which on the window is too short is still used, and nothing before it counts."""
+    newest_s = 0.5
+    begin_s = newest_s - C.velocity_window_s + 1e-6
+    places = {0.05: 4.8, begin_s: 5.0, 0.3: 5.3, newest_s: 5.0 + 2.0 * (newest_s - begin_s)}
+    assert told([state(x, time_s=t) for t, x in places.items()])[-1] == [("velocity_mismatch", pytest.approx(2.0))]
+    late = {(math.nextafter(t, 1.0) if t == begin_s else t): x for t, x in places.items() if t > 0.05}
+    assert not any(told([state(x, time_s=t) for t, x in late.items()]))
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_the_drift_is_summed_from_zero_so_that_the_least_counts(axis):
+    least = MonitorConfig(velocity_mismatch_m_s=1e-18)
+    samples = [state(*(1e-17 * k * (i == axis) for i in range(3)), time_s=k * STEP) for k in range(10)]
+    assert any(rules(samples, config=least))
+
+
+def test_an_older_sample_says_nothing():
+    assert not any(rules([state(time_s=1.0), state(x=7.0, z=3.0, time_s=0.9)], commanded=1.0))
+
+
+def test_tilt_of_exactly_a_limit_is_accepted():
+    tilt = math.acos(math.cos(1.0))
+    assert rules([state(roll=1.0)], config=MonitorConfig(tilt_rad=tilt)) == [[]]
+    assert rules([state(pitch=-1.0)], config=MonitorConfig(tilt_rad=0.5, tumbling_rad=tilt)) == [["tilt"]]
 
 
 def test_a_mismatch_of_exactly_the_limit_is_accepted():

@@ -110,6 +110,12 @@ def test_a_turn_is_compared_to_the_nearest_beam():
     assert votes([-0.5] * 4, turn_beams=1.6)[-1] == 4.0
 
 
+def test_a_turn_of_more_than_a_quarter_between_two_scans_is_taken_as_it_is():
+    """Two radians to the left are not 1.1 to the right."""
+    assert votes([-2.0] * 4, turn_beams=8.0) == [0.0, 0.0, 0.0, 4.0]
+    assert not any(votes([2.0] * 6, turn_beams=8.0))
+
+
 def test_a_reference_is_compared_for_exactly_a_second():
     assert votes([-0.25] * 5, time_step_s=1.0) == [0.0, 0.0, 0.0, 4.0, 5.0]
     assert votes([-0.25] * 9, time_step_s=1.0625) == [0.0] * 9
@@ -203,7 +209,7 @@ def test_two_senders_are_told_by_their_numbers():
     """L18: two counters in turn; gaps are lost scans, and scans without numbers say nothing."""
     assert numbered([5, 6, 900, 7, 901]) == [[], [], [], ["scan_source"], []]
     assert numbered([5, 5]) == [[], ["scan_source"]]
-    assert numbered([5, 0]) == [[], ["scan_source"]]
+    assert numbered([5, 0]) == numbered([0, -1]) == [[], ["scan_source"]]
     assert not any(numbered([0, 1, 2, 9, 40]))
     assert not any(numbered([0, 0, 0]))
 
@@ -238,6 +244,8 @@ def test_a_scan_seen_before_is_not_judged_again():
     one = scan(np.full(180, 2.0), 1.0, sequence=7)
     for _ in range(5):
         monitor.judge(one, state(time_s=1.0), found)
+    for time_s in (float("1.0"), 0.9):  # as old, in another object, and older: nor is either
+        monitor.judge(scan(np.full(90, 2.0), time_s, sequence=3), state(time_s=1.0), found)
     assert not found
 
 
@@ -312,6 +320,11 @@ def test_each_beam_has_its_own_time_and_motion():
 def test_motion_is_summed_from_zero_so_that_the_least_counts():
     least = config(monitors=MonitorConfig(mask_motion_m=1e-18))
     assert masked_counts([{90}] * 12, (1e-16, 0.0, 0.0), 0.0, least) == [0] * 9 + [1] * 3
+    monitor = ScanMonitor(least)
+    for k in range(12):  # what was flown before the first scan is not known and does not count
+        one = scan(np.full(180, 0.2), 8.0 + k * TICK_S)
+        monitor.judge(one, state(v=(1e-16 if k else 1.0, 0, 0), time_s=one.time_s), [])
+    assert monitor.masked(one, []) is not one
 
 
 def test_motion_before_a_return_came_is_not_counted():

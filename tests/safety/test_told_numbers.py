@@ -62,6 +62,7 @@ def of_estimate(states, health=None, commanded_m_s=0.0):
 
 def test_tilt_is_told_as_an_angle():
     assert of_estimate([state(roll=1.0)]) == [("tilt", pytest.approx(1.0), C.tilt_rad)]
+    assert of_estimate([state(roll=3.0)]) == [("tumbling", pytest.approx(3.0), C.tumbling_rad)]
     assert of_estimate([state(roll=0.3, pitch=-1.5)]) == [
         ("tumbling", pytest.approx(math.acos(math.cos(0.3) * math.cos(1.5))), C.tumbling_rad)
     ]
@@ -78,8 +79,9 @@ def test_steps_of_the_estimate_are_told_in_metres_with_what_the_time_between_all
 
 
 def test_the_autopilots_own_doubts_are_told_as_it_reports_them():
-    resets = [dataclasses.replace(state(time_s=8.0 + k * TICK_S), reset_counter=count) for k, count in enumerate((3, 7))]
-    assert of_estimate(resets) == [("estimate_reset", 7.0, 3.0)]
+    for before, now in ((3, 7), (255, 0), (0, 2)):
+        resets = [dataclasses.replace(state(time_s=8.0 + k * TICK_S), reset_counter=n) for k, n in enumerate((before, now))]
+        assert of_estimate(resets) == [("estimate_reset", float(now), float(before))]
     assert of_estimate([state(time_s=8.0)], Health(estimate_valid=False)) == [("estimate_invalid", 0.0, 1.0)]
     poor = [state(time_s=8.0 + k * TICK_S) for k in range(18)]
     assert of_estimate(poor, Health(accuracy_m=2.5)) == [("estimate_inaccurate", 2.5, C.accuracy_m)]
