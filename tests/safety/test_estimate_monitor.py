@@ -214,8 +214,9 @@ def test_the_drift_is_summed_from_zero_so_that_the_least_counts(axis):
     assert any(rules(samples, config=least))
 
 
-def test_an_older_sample_says_nothing():
-    assert not any(rules([state(time_s=1.0), state(x=7.0, z=3.0, time_s=0.9)], commanded=1.0))
+@pytest.mark.parametrize("time_s", [0.9, float("1.0")])
+def test_a_sample_no_newer_than_the_last_says_nothing(time_s):
+    assert not any(rules([state(time_s=1.0), state(x=7.0, z=3.0, time_s=time_s)], commanded=1.0))
 
 
 def test_tilt_of_exactly_a_limit_is_accepted():
