@@ -47,6 +47,7 @@ def test_one_tick_is_enough(health, rule):
 
 def test_restart_of_the_autopilot_is_never_forgotten():
     """K10: from the first count on; earlier restarts are history."""
+    assert not any(rules([Health(boots=int("1000")), Health(boots=int("1000"))]))  # equal, though not one object
     counts = [None, 2, 2, None, 3, 3, None]
     assert rules([Health(boots=n) for n in counts]) == [[]] * 4 + [["autopilot_rebooted"]] * 2 + [[]]
 
@@ -172,6 +173,12 @@ def test_six_foreign_echoes_over_at_least_six_tenths_of_a_second_and_within_one(
     assert echoed(at(0.0, 0.25, 0.5, 0.75, 0.875, 1.001))[-1] == []
     assert echoed(at(0.0, 0.25, 0.5, 0.75, 0.875, 1.001, 1.1))[-1] == told  # six of the last second
     assert not any(echoed(at(0.0, 0.2, 0.4, 0.6, 0.8)))
+
+
+def test_an_echo_told_again_counts_once_and_an_older_one_not_at_all():
+    assert not any(echoed([8.0] + [8.6] * 9))
+    assert not any(echoed([8.0, 8.7, 8.1, 8.2, 8.3, 8.4, 8.75]))
+    assert not any(rules([Health(echo_time_s=9.0)] * 9))  # a time without an echo
 
 
 def test_an_echo_is_foreign_by_its_distance_in_all_three_directions():

@@ -205,6 +205,7 @@ def test_speed_cap_is_the_largest_share_that_obeys_both_limits(wanted, changes):
 def test_the_cap_is_what_braking_and_delay_leave_together():
     t_s = CONFIG.dead_time_s + CONFIG.tick_s + CONFIG.lag_s
     assert cap_factor(0.0, 0.8, CONFIG) == pytest.approx(0.8)
+    assert cap_factor(1.0, 1.0, CONFIG) == pytest.approx(t_s / (t_s + 1.0))
     assert cap_factor(0.15, 0.8, CONFIG) == pytest.approx(0.8 * t_s / (t_s + 0.15))
     assert cap_factor(0.15, 0.8, config(lag_s=1.0)) == pytest.approx(0.8 * 1.25 / 1.4)
 
