@@ -12,7 +12,7 @@ from safety_plant import command, config
 
 from safety.config import speed_cap_m_s
 from safety.frames import CorridorVector
-from safety.limits import AT_REST, LastSent, limit_command, sent_after, within_limits
+from safety.limits import AT_REST, LastSent, _towards, limit_command, sent_after, within_limits
 
 DT_S = 0.05
 part = st.floats(-0.8, 0.8)  # below the speed limit, which would come first
@@ -104,6 +104,49 @@ def test_what_evades_keeps_to_the_very_limits_of_what_is_wanted(seed):
     found = within_limits(np.array([(one.x, one.y, one.z) for one in velocities]), last, dt_s, c)
     clear = np.abs(slack) > 1e-6
     assert found[clear].tolist() == (slack > 0.0)[clear].tolist()
+
+
+QUICK = {"max_horizontal_speed_m_s": 4.0, "max_acceleration_m_s2": 900.0, "max_jerk_m_s3": 8.0}  # half a metre per second a tick
+
+
+@pytest.mark.parametrize("way", [(1.5, 0.0), (0.5, 0.5), (0.0, -0.5), (1.0, 0.5)])
+def test_a_change_of_the_growth_that_is_exceeded_by_rounding_alone_is_free(way):
+    """After a growth of 1 m/s a tick ahead: half a billionth further than the change allows, ahead, beside and behind."""
+    nearest = min(max(way[0], 0.0), 1.0)
+    off = np.array((way[0] - nearest, way[1]))
+    for further_m_s, rules in ((0.5e-9, ()), (2e-9, ("jerk_limit",))):
+        x, y = np.array((nearest, 0.0)) + off * (0.5 + further_m_s) / 0.5
+        found = limit_command(command(x, y), LastSent(v(), v(4.0)), 0.25, 40.0, config(**QUICK))[1]
+        assert tuple(item.rule for item in found) == rules
+
+
+def test_growth_straight_on_is_cut_where_the_change_ends():
+    sent, _ = limit_command(command(2.0), LastSent(v(), v(4.0)), 0.25, 40.0, config(**QUICK))
+    assert sent.velocity.x == pytest.approx(1.5)
+
+
+def test_a_change_far_below_rounding_never_leads_beyond_the_growth_before():
+    """Twice that growth is wanted, and no change of it is allowed: whichever way numbers are rounded."""
+    random = np.random.default_rng(0)
+    stiff = config(max_horizontal_speed_m_s=4.0, max_acceleration_m_s2=900.0, max_jerk_m_s3=1e-9)
+    for _ in range(200):
+        before = random.uniform(-0.2, 0.2, 3)
+        sent, _ = limit_command(command(*(2.0 * before)), LastSent(v(), v(*before)), 1.0, 40.0, stiff)
+        assert distance_to_way(np.array((sent.velocity.x, sent.velocity.y, sent.velocity.z)), before) < 1e-7
+
+
+@pytest.mark.parametrize("length_m_s", [1.0, 1e-3, 1e-5, 1e-8, 0.0])
+def test_the_nearest_place_on_a_way_however_short(length_m_s):
+    end = length_m_s * np.array((0.6, -0.8, 0.0))
+    aside = length_m_s * np.array((0.8, 0.6, 2.0))
+    for share, nearest in ((-0.5, 0.0), (0.25, 0.25), (1.0, 1.0), (1.5, 1.0)):
+        for scale in (1.0, 0.1):
+            found = _towards(np.array([scale * (share * end + aside)]), v(*end), scale)
+            assert found[0] == pytest.approx(scale * nearest * end, rel=1e-9, abs=1e-7 * length_m_s)
+
+
+def test_of_a_way_shorter_than_rounding_next_to_nothing_is_kept():
+    assert abs(_towards(np.array([(1e-10, 0.0, 0.0)]), v(1e-10), 1.0)).max() < 1e-11
 
 
 def test_limits_met_exactly_by_what_evades_are_kept():
