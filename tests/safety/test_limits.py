@@ -109,20 +109,30 @@ def test_what_evades_keeps_to_the_very_limits_of_what_is_wanted(seed):
 QUICK = {"max_horizontal_speed_m_s": 4.0, "max_acceleration_m_s2": 900.0, "max_jerk_m_s3": 8.0}  # half a metre per second a tick
 
 
-@pytest.mark.parametrize("way", [(1.5, 0.0), (0.5, 0.5), (0.0, -0.5), (1.0, 0.5)])
-def test_a_change_of_the_growth_that_is_exceeded_by_rounding_alone_is_free(way):
-    """After a growth of 1 m/s a tick ahead: half a billionth further than the change allows, ahead, beside and behind."""
-    nearest = min(max(way[0], 0.0), 1.0)
-    off = np.array((way[0] - nearest, way[1]))
+@pytest.mark.parametrize("growth_m_s", [1.0, 0.5])
+@pytest.mark.parametrize("share", [-0.5, 0.0, 0.25, 0.5, 1.0, 1.5])
+def test_a_change_of_the_growth_that_is_exceeded_by_rounding_alone_is_free(share, growth_m_s):
+    """After a growth ahead: half a billionth further than the change allows, behind its begin, beside it and beyond its end."""
+    nearest = min(max(share, 0.0), 1.0) * growth_m_s
+    off = np.array((math.copysign(0.5, share), 0.0) if nearest != share * growth_m_s else (0.0, 0.5))
     for further_m_s, rules in ((0.5e-9, ()), (2e-9, ("jerk_limit",))):
         x, y = np.array((nearest, 0.0)) + off * (0.5 + further_m_s) / 0.5
-        found = limit_command(command(x, y), LastSent(v(), v(4.0)), 0.25, 40.0, config(**QUICK))[1]
+        found = limit_command(command(x, y), LastSent(v(), v(4.0 * growth_m_s)), 0.25, 40.0, config(**QUICK))[1]
         assert tuple(item.rule for item in found) == rules
 
 
 def test_growth_straight_on_is_cut_where_the_change_ends():
     sent, _ = limit_command(command(2.0), LastSent(v(), v(4.0)), 0.25, 40.0, config(**QUICK))
     assert sent.velocity.x == pytest.approx(1.5)
+
+
+def test_a_root_that_rounding_puts_below_zero_counts_as_zero():
+    """Nearly seven times the growth before, and a change so small that 2e-19 are missing under the root."""
+    before = v(0.04279656521709558, -0.046302189806385376, 0.03908254659025412)
+    stiff = config(max_horizontal_speed_m_s=4.0, max_acceleration_m_s2=900.0, max_jerk_m_s3=2.9615530964106104e-13)
+    wanted = command(0.300678262358965, -0.32530792845831247, 0.2745844710160662)
+    sent = limit_command(wanted, LastSent(v(), before), 1.0, 40.0, stiff)[0].velocity
+    assert (sent.x, sent.y, sent.z) == pytest.approx((before.x, before.y, before.z), rel=1e-3)
 
 
 def test_a_change_far_below_rounding_never_leads_beyond_the_growth_before():
