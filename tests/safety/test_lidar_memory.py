@@ -82,6 +82,8 @@ def test_malformed_scans_are_named(bad):
         (9, {"angle_increment_rad": math.nan}, "scan_not_finite"), (9, {"range_min_m": -math.inf}, "scan_not_finite"),
         (9, {"range_max_m": math.inf}, "scan_not_finite"), (9, {"ranges_m": np.ones(9, dtype=np.int32)}, "scan_shape"),
         (9, {"ranges_m": [1.0] * 9}, "scan_shape"), (9, {"ranges_m": np.ones((3, 3))}, "scan_shape"),
+        (9, {"ranges_m": np.array(1.0)}, "scan_shape"), (9, {"ranges_m": np.ones(9, dtype=bool)}, "scan_shape"),
+        (9, {"range_min_m": 5.0}, "scan_geometry"),
         (9, {"ranges_m": np.ones(9, dtype=np.float64)}, None),
     ],
 )  # fmt: skip
@@ -109,6 +111,7 @@ def test_bearings_are_those_of_the_newest_geometry(parts):
 
 
 @given(st.floats(-20.0, 20.0), st.floats(-4.0, 4.0), st.sampled_from([0.01, 0.3]))
+@example(-0.16, 0.0, 0.3)
 def test_offset_from_the_first_beam_is_within_one_turn_from_half_a_beam_before_it(bearing_rad, first_rad, step_rad):
     found = see(LidarScan(0.0, np.ones(9), first_rad, step_rad, 0.1, 4.0), state(), BeamTable(), C)
     offset = float(scan_offset(found, np.array([bearing_rad]))[0])
@@ -158,7 +161,7 @@ def test_tilted_beam_that_meets_the_ground_is_unknown(roll, pitch, beam, low):
     assert found.x_m.shape[0] == (0 if low else 1)
 
 
-@given(st.lists(st.booleans(), min_size=1, max_size=60), st.sampled_from([0.3, 0.1, 0.05, math.pi / 180]))
+@given(st.lists(st.booleans(), min_size=1, max_size=60), st.sampled_from([0.3, 0.1, 0.05, 0.01, math.pi / 180]))
 def test_a_bearing_is_unseen_where_more_than_a_fifth_of_the_beams_around_it_are_unknown(lost, increment_rad):
     """Within 0.26 rad on either side, one beam at least; at the edges of the view only what there is counts."""
     half = max(1, math.floor(0.26 / increment_rad))
@@ -166,6 +169,14 @@ def test_a_bearing_is_unseen_where_more_than_a_fifth_of_the_beams_around_it_are_
     wanted = [5 * sum(window) > len(window) for window in around]
     found = _unseen(np.where(lost, np.nan, 1.0), increment_rad)
     assert (found.tolist() if found is not None else [False] * len(lost)) == wanted
+
+
+def test_beams_at_the_very_edge_of_the_window_count():
+    """At 0.01 rad 26 beams on either side are within 0.26 rad: eleven of 53 lost ones are more than a fifth."""
+    lost = np.zeros(60, dtype=bool)
+    lost[[0, *range(30, 40)]] = True
+    assert _unseen(np.where(lost, np.nan, 1.0), 0.01)[26]
+    assert not _unseen(np.where(lost, np.nan, 1.0), 0.0101)[26]
 
 
 @pytest.mark.parametrize(("beams", "increment_rad"), [(3, math.pi / 2), (7, math.pi / 4), (180, math.pi / 180)])
@@ -234,6 +245,16 @@ def test_a_scan_is_placed_as_each_beam_by_itself_would_be(seed):
     assert found.range_m == pytest.approx(range_m, nan_ok=True)
     assert found.free_m == pytest.approx(free_m, nan_ok=True)
     assert np.array([found.x_m, found.y_m, found.spread_m]) == pytest.approx(places)
+
+
+@pytest.mark.parametrize(("z", "pitch"), [(4.0, 0.076), (4.0, -0.076), (0.45, -0.07), (0.45, 0.07)])
+def test_the_least_tilt_that_changes_anything_is_not_overlooked(z, pitch):
+    """The band of 0.3 m is left 5 cm before the range ends; a return at 3.9 m is 0.02 m too low to be an obstacle."""
+    one, pose = scan(np.where(np.arange(180) % 2, 3.9, np.inf), 0.0), state(z=z, pitch=pitch)
+    found = see(one, pose, BeamTable(), C)
+    range_m, free_m, _ = slowly_seen(one, pose, C)
+    assert found.range_m == pytest.approx(range_m, nan_ok=True)
+    assert found.free_m == pytest.approx(free_m, nan_ok=True)
 
 
 def test_tilt_shortens_the_horizontal_distance():
