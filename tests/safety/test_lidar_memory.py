@@ -161,7 +161,7 @@ def test_tilted_beam_that_meets_the_ground_is_unknown(roll, pitch, beam, low):
     assert found.x_m.shape[0] == (0 if low else 1)
 
 
-@given(st.lists(st.booleans(), min_size=1, max_size=60), st.sampled_from([0.3, 0.1, 0.05, 0.01, math.pi / 180]))
+@given(st.lists(st.booleans(), min_size=1, max_size=60), st.sampled_from([0.3, 0.1, 0.052, 0.05, 0.01, math.pi / 180]))
 def test_a_bearing_is_unseen_where_more_than_a_fifth_of_the_beams_around_it_are_unknown(lost, increment_rad):
     """Within 0.26 rad on either side, one beam at least; at the edges of the view only what there is counts."""
     half = max(1, math.floor(0.26 / increment_rad))
