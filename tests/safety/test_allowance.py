@@ -93,6 +93,18 @@ def test_directions_and_speeds_due_are_those_of_the_slow_way(seed):
     assert found.outward_m_s == pytest.approx(np.array([min(d, push @ n) if d > 0.0 else d for n, d in asked]))
 
 
+@pytest.mark.parametrize("deeper_m", [0.0, 1e-9])
+def test_a_point_as_deep_in_the_hull_as_drift_can_bring_it_is_still_held_off(deeper_m):
+    """Margin and 5 cm: a quarter and 0.05 m; less than a billionth more is no drift any more, and the way is only not nearer."""
+    wide = config(margin_m=0.25, vehicle_radius_m=0.35)
+    clear_m = -(0.25 + POINT_BAND) - 0.25 * 0.25
+    assert -clear_m - 0.25 * 0.25 == 0.25 + POINT_BAND  # met exactly, in floating point too
+    rest = Tubes(np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+    points = np.array([[5.0], [0.0]])
+    _, due = _outward(rest, np.array([clear_m - deeper_m]), points, np.zeros(2), False, wide)
+    assert due.tolist() == [0.0 if deeper_m else wide.hold_off_speed_m_s]
+
+
 @pytest.mark.parametrize("room", [-0.9, -0.52, -0.5201, -0.5199, -0.3, -0.045, -0.03, -0.02, -0.0201, -0.01, 0.0, 0.004, 0.3])
 def test_vertical_bounds_reach_floor_and_ceiling_and_lead_back(room):
     position, tube, points, clear, fence, _ = scene(0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import random
 
 import pytest
 from hypothesis import given, settings
@@ -81,6 +82,7 @@ def test_reset_counter():
         return [dataclasses.replace(s, reset_counter=c) for s, c in zip(cruise(len(values)), values, strict=True)]
 
     assert rules(counted([3, 3, 4, 4, 3])) == [[], [], ["estimate_reset"], [], ["estimate_reset"]]
+    assert not any(rules(counted([int("1000"), int("1000")])))  # equal, though not one object
     assert rules(counted([255, 0])) == [[], ["estimate_reset"]]
     assert not any(rules(counted([None, 3, 3, None, 4])))
 
@@ -100,6 +102,135 @@ def test_velocity_mismatch_needs_the_whole_window_and_the_limit():
     assert not any(rules(drifting(C.velocity_mismatch_m_s - 1e-6)))
     assert rules(drifting(C.velocity_mismatch_m_s + 1e-6)) == [[]] * 7 + [["velocity_mismatch"]]
     assert rules(drifting(-C.velocity_mismatch_m_s - 1e-6))[7] == ["velocity_mismatch"]
+
+
+@pytest.mark.parametrize("rate_m_s", [(1.2, 0, 0), (0, 1.2, 0), (0, 0, 1.2), (-0.9, 0.7, -1.2), (0.9, -0.7, 1.2)])
+def test_a_drift_below_the_limit_is_never_accused_however_far_it_leads(rate_m_s):
+    """Ten seconds: what counts is the mean over the window, not what has added up since the start."""
+    drift = [
+        state(5.0 + rate_m_s[0] * t, rate_m_s[1] * t, 2.0 + rate_m_s[2] * t, time_s=t) for t in (k * STEP for k in range(160))
+    ]
+    assert not any(rules(drift))
+
+
+def told(states, commanded=0.0, config=C):
+    """What each sample of a run makes the monitor tell: rule and value."""
+    monitor, result = EstimateMonitor(config), []
+    for sample in states:
+        found = []
+        monitor.judge(sample, UNKNOWN, commanded, sample.time_s, found)
+        result.append([(item.rule, item.value) for item in found])
+    return result
+
+
+def wandering(chance, size_m_s, ticks=40):
+    """Samples at uneven times whose velocity changes, and whose position moves on by its mean and by a drift besides."""
+    p, v, t, result, drifts = [5.0, 0.0, 2.0], [0.3, -0.2, 0.1], 8.0, [], []
+    for _ in range(ticks):
+        result.append(state(*p, v=tuple(v), time_s=t))
+        dt = chance.choice((0.03, 0.05, 0.08))
+        w = [part + chance.uniform(-0.2, 0.2) for part in v]
+        drift = [size_m_s * dt * chance.uniform(-0.6, 1.0) for _ in range(3)]
+        drifts.append((t + dt, *drift))
+        p = [a + 0.5 * (b + c) * dt + d for a, b, c, d in zip(p, v, w, drift, strict=True)]
+        v, t = w, t + dt
+    return result, drifts
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_mismatch_is_the_drift_over_the_shortest_window_that_is_long_enough(seed):
+    sharp = MonitorConfig(velocity_mismatch_m_s=0.3, position_jump_m=1.0, altitude_jump_m=1.0)
+    states, drifts = wandering(random.Random(seed), 1.2)
+    found = told(states, config=sharp)
+    assert any(found)
+    for k, sample in enumerate(states):
+        begins = [s.time_s for s in states[: k + 1] if s.time_s <= sample.time_s - C.velocity_window_s + 1e-6]
+        since = [d for d in drifts if begins and begins[-1] + 1e-9 < d[0] <= sample.time_s + 1e-9]
+        span = sample.time_s - begins[-1] if begins else math.inf
+        x, y, z = (sum(d[axis] for d in since) / span for axis in (1, 2, 3))
+        worst = max(math.hypot(x, y), abs(z))
+        assert found[k] == ([("velocity_mismatch", pytest.approx(worst))] if worst > sharp.velocity_mismatch_m_s else [])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_the_mean_of_both_velocities_leaves_is_the_jump(seed):
+    """E1, E9: horizontally and vertically by themselves, from any place and time on, at any speeds."""
+    chance = random.Random(seed)
+    for across_m, up_m in ((0.7, 0.0), (0.0, 0.7), (0.0, -0.7)):
+        place, v, w = ([chance.uniform(-2.0, 2.0) for _ in range(3)] for _ in range(3))
+        dt, angle = chance.choice((0.05, 0.2)), chance.uniform(-math.pi, math.pi)
+        jump = (across_m * math.cos(angle), across_m * math.sin(angle), up_m)
+        then = [a + 0.5 * (b + c) * dt + d for a, b, c, d in zip(place, v, w, jump, strict=True)]
+        pair = [state(*place, v=tuple(v), time_s=8.0), state(*then, v=tuple(w), time_s=8.0 + dt)]
+        rule = "altitude_jump" if up_m else "estimate_jump"
+        assert told(pair) == [[], [(rule, pytest.approx(0.7))]]
+
+
+def jumps_at(times_s):
+    """Rules of a vehicle that stands, and is a metre to the side from each of these times on, back from the next."""
+    standing = [k * STEP for k in range(round(8.0 / STEP))]
+    samples = [state(y=float(sum(at <= t for at in times_s) % 2), time_s=20.0 + t) for t in standing]
+    return [rule for found in rules(samples) for rule in found]
+
+
+def test_a_second_jump_within_exactly_five_seconds_is_worse():
+    assert jumps_at((1.0, 6.0)) == ["estimate_jump", "estimate_jump_again"]
+    assert jumps_at((1.0, 6.0 + STEP)) == ["estimate_jump", "estimate_jump"]
+    assert jumps_at((1.0, 3.0, 7.5)) == ["estimate_jump", "estimate_jump_again", "estimate_jump_again"]
+
+
+@pytest.mark.parametrize("rule", ["position", "altitude"])
+def test_after_a_step_velocity_and_position_are_compared_anew(rule):
+    """1.5 m/s unexplained is accepted; with a step of a metre inside the window it would be too much."""
+    shift = (1.0, 0.0, 0.0) if rule == "position" else (0.0, 0.0, 1.0)
+    samples = cruise(30, shift=shift, at=15)
+    drifting = [dataclasses.replace(s, velocity=CorridorVector(-1.0, 0.0, 0.0)) for s in samples]
+    assert [len(found) for found in rules(drifting)] == [int(k == 15) for k in range(30)]
+
+
+def test_a_step_of_exactly_the_limit_is_accepted():
+    """Numbers that are exact in binary."""
+    exact = MonitorConfig(position_jump_m=0.25, altitude_jump_m=0.25, velocity_mismatch_m_s=1.0, velocity_window_s=5.0)
+    limit = 0.25 + STEP
+    for shift in ((limit, 0, 0), (0, -limit, 0), (0, 0, limit), (0, 0, -limit)):
+        pair = [state(4.0, 0.0, 2.0), state(4.0 + shift[0], shift[1], 2.0 + shift[2], time_s=STEP)]
+        assert not any(rules(pair, config=exact))
+
+
+def test_the_window_begins_with_the_newest_sample_that_makes_it_long_enough():
+    """A sample at the very time from which on the window is too short is still used, and nothing before it counts."""
+    newest_s = 0.5
+    begin_s = newest_s - C.velocity_window_s + 1e-6
+    places = {0.05: 4.8, begin_s: 5.0, 0.3: 5.3, newest_s: 5.0 + 2.0 * (newest_s - begin_s)}
+    assert told([state(x, time_s=t) for t, x in places.items()])[-1] == [("velocity_mismatch", pytest.approx(2.0))]
+    late = {(math.nextafter(t, 1.0) if t == begin_s else t): x for t, x in places.items() if t > 0.05}
+    assert not any(told([state(x, time_s=t) for t, x in late.items()]))
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_the_drift_is_summed_from_zero_so_that_the_least_counts(axis):
+    least = MonitorConfig(velocity_mismatch_m_s=1e-18)
+    samples = [state(*(1e-17 * k * (i == axis) for i in range(3)), time_s=k * STEP) for k in range(10)]
+    assert any(rules(samples, config=least))
+
+
+@pytest.mark.parametrize("time_s", [0.9, float("1.0")])
+def test_a_sample_no_newer_than_the_last_says_nothing(time_s):
+    assert not any(rules([state(time_s=1.0), state(x=7.0, z=3.0, time_s=time_s)], commanded=1.0))
+
+
+def test_tilt_of_exactly_a_limit_is_accepted():
+    tilt = math.acos(math.cos(1.0))
+    assert rules([state(roll=1.0)], config=MonitorConfig(tilt_rad=tilt)) == [[]]
+    assert rules([state(pitch=-1.0)], config=MonitorConfig(tilt_rad=0.5, tumbling_rad=tilt)) == [["tilt"]]
+
+
+def test_a_mismatch_of_exactly_the_limit_is_accepted():
+    exact = MonitorConfig(velocity_mismatch_m_s=1.5, velocity_window_s=0.5)
+    for axis in range(3):
+        samples = [state(*(1.5 * k * STEP * (i == axis) for i in range(3)), time_s=8.0 + k * STEP) for k in range(20)]
+        assert not any(rules(samples, config=exact))
+        assert any(rules(samples, config=MonitorConfig(velocity_mismatch_m_s=1.4999, velocity_window_s=0.5)))
 
 
 def test_velocity_that_turns_its_sign_is_seen_in_time():
@@ -139,6 +270,58 @@ def test_a_frozen_estimate_stays_one_when_nothing_is_commanded_any_more():
         monitor.judge(sample, Health(), 0.5 if k < 8 else 0.0, k * 0.05, found)
         faults.append([item.rule for item in found])
     assert faults == [[]] * 5 + [["estimate_frozen"]] * 15 + [[]] * 10
+
+
+def test_a_microsecond_of_rounding_is_forgiven():
+    """From time zero on, so that every difference is exact: the last sample just completes the window, or just does not."""
+    rate = 2.0 * C.velocity_mismatch_m_s
+    for short_s, is_told in ((1e-6, True), (2e-6, False)):
+        last_s = C.velocity_window_s - short_s
+        drift = [state(5.0 + rate * t, time_s=t) for t in (0.0, 0.1, 0.2, 0.3, last_s)]
+        assert (rules(drift)[-1] == ["velocity_mismatch"]) == is_told
+    for long_s, is_told in ((1e-6, False), (2e-6, True)):
+        still = [state(v=(0.2, 0, 0), time_s=t) for t in (0.0, 0.1, C.frozen_state_s + long_s)]
+        assert (rules(still, commanded=0.5)[-1] == ["estimate_frozen"]) == is_told
+
+
+@pytest.mark.parametrize("changed", ["position", "velocity"])
+@pytest.mark.parametrize("axis", "xyz")
+def test_one_bit_of_position_or_velocity_is_enough_to_be_alive(changed, axis):
+    samples = []
+    for k, one in enumerate(standing(20)):
+        vector = getattr(one, changed)
+        moved = dataclasses.replace(vector, **{axis: getattr(vector, axis) + 1e-12 * k})
+        samples.append(dataclasses.replace(one, **{changed: moved}))
+    assert not any(rules(samples, commanded=0.5))
+
+
+def test_a_still_estimate_is_counted_from_its_last_new_bit():
+    """Times far from zero; moving first, then still for 0.25 s and more."""
+    moving = [state(5.0 + 0.2 * k * STEP, v=(0.2, 0, 0), time_s=8.0 + k * STEP) for k in range(6)]
+    still = [dataclasses.replace(moving[-1], time_s=8.0 + k * STEP) for k in range(6, 12)]
+    wanted = [[("estimate_frozen", k * STEP)] if k * STEP > C.frozen_state_s else [] for k in range(1, 7)]
+    assert told(moving + still, 0.5) == [[]] * 6 + wanted
+    assert told([*standing(6, STEP)], 0.5) == [[]] * 4 + [[("estimate_frozen", k * STEP)] for k in (4, 5)]
+
+
+def test_a_monitor_that_was_reset_judges_like_a_new_one():
+    """Also just after a jump, a frozen estimate and a bad accuracy."""
+
+    def run(monitor):
+        result = []
+        for k in range(24):
+            y = 1.0 if 6 <= k < 9 else 0.0
+            found = []
+            sample = state(y=y, v=(0.2, 0, 0) if k < 12 else (0.2, 1e-9, 0), time_s=8.0 + k * STEP, roll=1.0 * (k == 3))
+            monitor.judge(sample, Health(accuracy_m=3.0), 0.5 if k >= 2 else 0.0, sample.time_s, found)
+            result.append([(item.rule, item.value) for item in found])
+        return result
+
+    used = EstimateMonitor(C)
+    first = run(used)
+    assert {rule for found in first for rule, _ in found} >= {"estimate_jump_again", "estimate_frozen", "estimate_inaccurate"}
+    used.reset()
+    assert run(used) == first == run(EstimateMonitor(C))
 
 
 def test_the_same_sample_twice_is_neither_frozen_nor_a_jump():

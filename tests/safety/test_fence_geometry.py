@@ -197,15 +197,16 @@ SQUARE = ((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0))
 
 
 @pytest.mark.parametrize("ring", [SQUARE, (SQUARE[0], *SQUARE[:0:-1])])
-def test_right_on_an_edge_the_way_out_is_to_its_allowed_side(ring):
+@pytest.mark.parametrize(("x", "y", "inwards"), [(2, 0, (0, 1)), (4, 2, (-1, 0)), (2, 4, (0, -1)), (0, 2, (1, 0))])
+def test_right_on_an_edge_the_way_out_is_to_its_allowed_side(ring, x, y, inwards):
     fence = FenceGuard(PolygonFence(ring, ()), 0.0, 3.0)
-    place = np.array((2.0, 0.0, 1.0))
+    place = np.array((x, y, 1.0))
     start = Start(np.array((place, place)), np.zeros((2, 3)))
     tube = Tubes(np.tile(place, (2, 1, 1)), np.tile(place, (2, 1, 1)))
     ways = fence.ways_out(tube, fence.look(CorridorVector(*place), start, 0.5))
-    lower = int(np.argmin(ways.room_m))
-    assert ways.normals[:, lower] == pytest.approx((0.0, 1.0))
-    assert ways.room_m[lower] == 0.0
+    nearest = int(np.argmin(ways.room_m))
+    assert ways.normals[:, nearest] == pytest.approx(inwards)
+    assert ways.room_m[nearest] == 0.0
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,14 @@ def test_single_lost_beam_is_bridged_but_a_sector_is_not():
     assert seen_at(looked(ranges=ranges), 5.0 + 1.05, -1.4)
 
 
+def test_a_sector_that_loses_every_third_beam_is_not_seen():
+    """Each lost beam has good neighbours, but too many are lost around there: what the good ones show does not count."""
+    ranges = np.full(180, np.inf)
+    ranges[75:105:3] = np.nan
+    assert not seen_at(looked(ranges=ranges), 5.0 + BEHIND, 0.0)
+    assert seen_at(looked(ranges=ranges), 5.0 + 1.05, -1.4)
+
+
 def test_all_lost_shows_nothing():
     assert len(seen_cells(looked(ranges=np.full(180, np.nan)))) == len(seen_cells(looked(ranges=np.zeros(180))))
 

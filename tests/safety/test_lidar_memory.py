@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import math
 
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from safety_plant import config, scan, state
+from safety_plant import command, config, scan, state
 
-from safety.lidar import BeamTable, clean_ranges, scan_problem, see
+from safety.filter import SafetyFilter
+from safety.lidar import BeamTable, _unseen, clean_ranges, scan_offset, scan_problem, see
 from safety.memory import CAPACITY, LEAST_DEPTH_M, SAME_PLACE_M, ObstacleMemory, _edges
 from safety.messages import LidarScan
 
@@ -68,6 +71,54 @@ def test_malformed_scans_are_named(bad):
         assert str(scan_problem(bad(scan()))).startswith("scan_")
 
 
+@pytest.mark.parametrize(
+    ("beams", "parts", "problem"),
+    [
+        (2, {}, None), (1, {}, "scan_shape"), (4096, {}, None), (4097, {}, "scan_shape"),
+        (2, {"angle_increment_rad": math.pi + 0.5e-3}, None), (2, {"angle_increment_rad": math.pi + 0.51e-3}, "scan_geometry"),
+        (9, {"angle_increment_rad": 0.0}, "scan_geometry"), (9, {"angle_increment_rad": -1e-9}, "scan_geometry"),
+        (9, {"range_min_m": 0.0}, None), (9, {"range_min_m": -1e-9}, "scan_geometry"), (9, {"range_min_m": 4.0}, "scan_geometry"),
+        (9, {"time_s": math.nan}, "scan_not_finite"), (9, {"angle_min_rad": math.inf}, "scan_not_finite"),
+        (9, {"angle_increment_rad": math.nan}, "scan_not_finite"), (9, {"range_min_m": -math.inf}, "scan_not_finite"),
+        (9, {"range_max_m": math.inf}, "scan_not_finite"), (9, {"ranges_m": np.ones(9, dtype=np.int32)}, "scan_shape"),
+        (9, {"ranges_m": [1.0] * 9}, "scan_shape"), (9, {"ranges_m": np.ones((3, 3))}, "scan_shape"),
+        (9, {"ranges_m": np.array(1.0)}, "scan_shape"), (9, {"ranges_m": np.ones(9, dtype=bool)}, "scan_shape"),
+        (9, {"range_min_m": 5.0}, "scan_geometry"),
+        (9, {"ranges_m": np.ones(9, dtype=np.float64)}, None),
+    ],
+)  # fmt: skip
+def test_what_a_scan_may_be_is_exact(beams, parts, problem):
+    one = LidarScan(0.0, np.ones(beams, dtype=np.float32), -1.0, 0.0015, 0.1, 4.0)
+    assert scan_problem(dataclasses.replace(one, **parts)) == problem
+
+
+def test_ranges_are_cleaned_exactly_at_both_ends():
+    least, most = 0.1, 4.0 + 0.1
+    ranges = np.array([math.nextafter(least, 0.0), least, most, math.nextafter(most, 9.0), -math.inf, math.inf])
+    cleaned = clean_ranges(LidarScan(0.0, ranges, -1.0, 0.1, least, 4.0))
+    assert cleaned.tolist() == pytest.approx([0.05, least, most, math.nan, 0.05, math.inf], nan_ok=True)
+
+
+@pytest.mark.parametrize("parts", [{}, {"angle_min_rad": -1.2}, {"angle_increment_rad": 0.02}, {"ranges_m": np.ones(30)}])
+def test_bearings_are_those_of_the_newest_geometry(parts):
+    table, first = BeamTable(), LidarScan(0.0, np.ones(40), -1.0, 0.03, 0.1, 4.0)
+    table.prepare(first)
+    then = dataclasses.replace(first, **parts)
+    table.prepare(then)
+    bearings = [then.angle_min_rad + k * then.angle_increment_rad for k in range(then.ranges_m.shape[0])]
+    assert table.cos == pytest.approx(np.cos(bearings))
+    assert table.sin == pytest.approx(np.sin(bearings))
+
+
+@given(st.floats(-20.0, 20.0), st.floats(-4.0, 4.0), st.sampled_from([0.01, 0.3]))
+@example(-0.16, 0.0, 0.3)
+def test_offset_from_the_first_beam_is_within_one_turn_from_half_a_beam_before_it(bearing_rad, first_rad, step_rad):
+    found = see(LidarScan(0.0, np.ones(9), first_rad, step_rad, 0.1, 4.0), state(), BeamTable(), C)
+    offset = float(scan_offset(found, np.array([bearing_rad]))[0])
+    assert -0.5 * step_rad - 1e-12 <= offset <= 2.0 * math.pi - 0.5 * step_rad + 1e-12
+    assert math.remainder(offset - (bearing_rad - first_rad), 2.0 * math.pi) == pytest.approx(0.0, abs=1e-9)
+
+
 def rest(s):
     return s.angle_min_rad, s.angle_increment_rad, s.range_min_m, s.range_max_m
 
@@ -110,6 +161,102 @@ def test_tilted_beam_that_meets_the_ground_is_unknown(roll, pitch, beam, low):
     assert found.x_m.shape[0] == (0 if low else 1)
 
 
+@given(st.lists(st.booleans(), min_size=1, max_size=60), st.sampled_from([0.3, 0.1, 0.052, 0.05, 0.01, math.pi / 180]))
+def test_a_bearing_is_unseen_where_more_than_a_fifth_of_the_beams_around_it_are_unknown(lost, increment_rad):
+    """Within 0.26 rad on either side, one beam at least; at the edges of the view only what there is counts."""
+    half = max(1, math.floor(0.26 / increment_rad))
+    around = [lost[max(i - half, 0) : i + half + 1] for i in range(len(lost))]
+    wanted = [5 * sum(window) > len(window) for window in around]
+    found = _unseen(np.where(lost, np.nan, 1.0), increment_rad)
+    assert (found.tolist() if found is not None else [False] * len(lost)) == wanted
+
+
+def test_beams_at_the_very_edge_of_the_window_count():
+    """At 0.01 rad 26 beams on either side are within 0.26 rad: eleven of 53 lost ones are more than a fifth."""
+    lost = np.zeros(60, dtype=bool)
+    lost[[0, *range(30, 40)]] = True
+    assert _unseen(np.where(lost, np.nan, 1.0), 0.01)[26]
+    assert not _unseen(np.where(lost, np.nan, 1.0), 0.0101)[26]
+
+
+@pytest.mark.parametrize(("beams", "increment_rad"), [(3, math.pi / 2), (7, math.pi / 4), (180, math.pi / 180)])
+def test_a_view_that_lacks_a_whole_beam_has_edges(beams, increment_rad):
+    def all_round(step_rad):
+        pose = state()
+        return see(LidarScan(0.0, np.full(beams, 2.0), -1.0, step_rad, 0.1, 4.0), pose, BeamTable(), C).all_round
+
+    assert not all_round(increment_rad)
+    assert all_round(2.0 * math.pi / beams)
+    assert all_round(2.0 * math.pi / (beams + 0.9))
+
+
+def turn_about(axis, angle_rad):
+    """Right-handed rotation about x (0), y (1) or z (2)."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = math.cos(angle_rad)
+    matrix[i, j], matrix[j, i] = -math.sin(angle_rad), math.sin(angle_rad)
+    return matrix
+
+
+def slowly_seen(one, pose, c):
+    """Per beam: horizontal range, horizontal free distance, place of its return; by rotating one beam at a time."""
+    back_s = pose.time_s - one.time_s
+    origin = [getattr(pose.position, k) - getattr(pose.velocity, k) * back_s for k in "xyz"]
+    yaw = pose.yaw_rad - pose.yaw_rate_rad_s * back_s
+    attitude = turn_about(2, yaw) @ turn_about(1, -pose.pitch_rad) @ turn_about(0, pose.roll_rad)
+    ranges, free, places = [], [], []
+    for k, measured in enumerate(one.ranges_m.astype(float)):
+        bearing = one.angle_min_rad + k * one.angle_increment_rad
+        way = attitude @ (math.cos(bearing), math.sin(bearing), 0.0)
+        r = 0.5 * one.range_min_m if measured < one.range_min_m else measured
+        r = math.nan if math.isfinite(r) and r > one.range_max_m + 0.1 else r
+        level = math.hypot(way[0], way[1])
+        free.append(min(r, one.range_max_m, 0.3 / max(abs(way[2]), 1e-6)) * level if not math.isnan(r) else math.nan)
+        on_ground = math.isfinite(r) and origin[2] + r * way[2] < c.ground_z_m + c.ground_band_m
+        ranges.append(math.nan if on_ground else r * level)
+        if math.isfinite(ranges[-1]):
+            places.append((origin[0] + r * way[0], origin[1] + r * way[1], 0.5 * r * one.angle_increment_rad))
+    return np.array(ranges), np.array(free), np.array(places).reshape(-1, 3).T
+
+
+ATTITUDES = list(itertools.product((0.0, 0.03, -0.06, 0.3, -0.001), repeat=2))
+HEIGHTS_M = (0.25, 0.45, 0.75, 0.85, 4.0)
+
+
+@pytest.mark.parametrize("seed", range(len(ATTITUDES) * len(HEIGHTS_M)))
+def test_a_scan_is_placed_as_each_beam_by_itself_would_be(seed):
+    """Any attitude, height, ground and age of the scan; also tilts so small that nothing meets the ground or leaves the band."""
+    random = np.random.default_rng(seed)
+    beams, reach = int(random.choice([12, 60])), float(random.choice([4.0, 8.0]))
+    c = config(ground_z_m=float(random.choice([0.0, 0.5, -1.0])), ground_band_m=float(random.choice([0.2, 0.05])))
+    ranges = random.uniform(0.0, reach + 0.3, beams)
+    ranges[random.random(beams) < 0.2] = np.inf
+    ranges[random.random(beams) < 0.1] = np.nan
+    one = LidarScan(8.0, ranges, -1.3, float(random.choice([0.02, 0.05])), 0.1, reach)
+    (roll, pitch), height = ATTITUDES[seed % len(ATTITUDES)], HEIGHTS_M[seed // len(ATTITUDES)]
+    pose = state(
+        x=random.uniform(-3, 3), y=random.uniform(-3, 3), z=c.ground_z_m + height, v=tuple(random.uniform(-1, 1, 3)),
+        time_s=8.0 + float(random.choice([0.0, 0.1])), yaw=random.uniform(-4, 4), yaw_rate=random.uniform(-1, 1),
+        roll=roll, pitch=pitch,
+    )  # fmt: skip
+    found = see(one, pose, BeamTable(), c)
+    range_m, free_m, places = slowly_seen(one, pose, c)
+    assert found.range_m == pytest.approx(range_m, nan_ok=True)
+    assert found.free_m == pytest.approx(free_m, nan_ok=True)
+    assert np.array([found.x_m, found.y_m, found.spread_m]) == pytest.approx(places)
+
+
+@pytest.mark.parametrize(("z", "pitch"), [(4.0, 0.076), (4.0, -0.076), (0.45, -0.07), (0.45, 0.07)])
+def test_the_least_tilt_that_changes_anything_is_not_overlooked(z, pitch):
+    """The band of 0.3 m is left 5 cm before the range ends; a return at 3.9 m is 0.02 m too low to be an obstacle."""
+    one, pose = scan(np.where(np.arange(180) % 2, 3.9, np.inf), 0.0), state(z=z, pitch=pitch)
+    found = see(one, pose, BeamTable(), C)
+    range_m, free_m, _ = slowly_seen(one, pose, C)
+    assert found.range_m == pytest.approx(range_m, nan_ok=True)
+    assert found.free_m == pytest.approx(free_m, nan_ok=True)
+
+
 def test_tilt_shortens_the_horizontal_distance():
     found = seen(one_return(90, 2.0), state(z=3.0, pitch=-0.3))
     assert found.x_m[0] - 5.0 == pytest.approx(2.0 * math.cos(0.3), abs=1e-3)
@@ -135,6 +282,7 @@ def test_the_far_side_of_an_edge_is_kept_along_its_beam():
 
 
 @given(st.lists(st.sampled_from([1.0, 1.1, 1.5, 3.0, math.inf, math.nan]), min_size=2, max_size=12))
+@example([0.4, 0.2, 0.4])  # exactly as much further as the same thing may be
 def test_a_return_is_at_an_edge_when_a_beam_beside_it_saw_clearly_further(values):
     def further(i, j):
         return 0 <= j < len(values) and values[j] - values[i] > SAME_PLACE_M
@@ -186,6 +334,14 @@ def test_far_points_are_dropped():
     fed(memory, one_return(90, 3.0), 0.0)
     memory.update(seen(None, state(x=-5.0), 0.05), 5.0, C)
     assert memory.count == 0
+
+
+@pytest.mark.parametrize(("range_m", "points"), [(4.29, WITH_FAR_SIDE), (4.31, 0)])
+def test_the_filter_remembers_what_a_stop_from_twice_the_speed_limit_could_reach_and_a_little_more(range_m, points):
+    """From 2.4 m/s it takes 0.6 m in the dead time and 1.8 m to brake; then 0.4 m of keep-out and 1.5 m: 4.3 m in all."""
+    safety = SafetyFilter(C)
+    safety.apply(command(), state(), scan(one_return(90, range_m), range_max=8.0), 0.0)
+    assert safety._memory.count == points
 
 
 def test_age_widens_a_point_up_to_its_bounds():

@@ -47,6 +47,7 @@ def test_one_tick_is_enough(health, rule):
 
 def test_restart_of_the_autopilot_is_never_forgotten():
     """K10: from the first count on; earlier restarts are history."""
+    assert not any(rules([Health(boots=int("1000")), Health(boots=int("1000"))]))  # equal, though not one object
     counts = [None, 2, 2, None, 3, 3, None]
     assert rules([Health(boots=n) for n in counts]) == [[]] * 4 + [["autopilot_rebooted"]] * 2 + [[]]
 
@@ -60,23 +61,40 @@ def test_three_late_ticks_within_a_second():
     assert rules(spread)[-1] == ["loop_late"]
     too_far = [late if k in (0, 8, 17) else good for k in range(18)]
     assert not any(rules(too_far))
+    assert not any(rules([late if k in (0, 9, 18) else good for k in range(19)], start_s=0.6))  # 18 ticks, the clock just begun
+    assert rules([late if k in (0, 8, 16) else good for k in range(17)], start_s=0.5)[-1] == ["loop_late"]
 
 
 def test_a_pause_between_two_calls():
     """C4: 0.25 s is accepted."""
     assert not any(rules([Health()] * 3, step_s=C.gap_s))
+    for start_s in (0.1, 1.0, 700.0):
+        assert rules([Health()] * 2, step_s=0.3, start_s=start_s) == [[], ["tick_gap"]]
+        assert not any(rules([Health()] * 9, step_s=0.24, start_s=start_s))
     assert rules([Health()] * 3, step_s=C.gap_s + 1e-4) == [[], ["tick_gap"], ["tick_gap"]]
+
+
+def test_a_microsecond_of_rounding_is_forgiven_whenever_time_is_measured():
+    slow = Health(link_delay_s=1.0)
+    assert rules([Health()] * 2, step_s=C.gap_s + 1e-6, start_s=0.0)[-1] == []
+    assert rules([Health()] * 2, step_s=C.gap_s + 2e-6, start_s=0.0)[-1] == ["tick_gap"]
+    assert "link_slow" in rules([slow] * 2, step_s=C.link_delay_lasts_s - 1e-6, start_s=0.0)[-1]
+    assert "link_slow" not in rules([slow] * 2, step_s=C.link_delay_lasts_s - 2e-6, start_s=0.0)[-1]
+    assert echoed([0.0, 0.1, 0.2, 0.3, 0.4, C.echo_s - 1e-6])[-1] == ["foreign_setpoint"]
+    assert echoed([0.0, 0.1, 0.2, 0.3, 0.4, C.echo_s - 2e-6])[-1] == []
 
 
 def test_slow_link_must_last():
     """K4: half a second is accepted; more, for 0.4 s, is not; one good answer starts anew."""
     slow = Health(link_delay_s=C.link_delay_s + 1e-9)
     assert not any(rules([Health(link_delay_s=C.link_delay_s)] * 40))
-    assert rules([slow] * 10, step_s=0.05) == [[]] * 8 + [["link_slow"]] * 2
+    for start_s in (0.1, 8.0):
+        assert rules([slow] * 10, step_s=0.05, start_s=start_s) == [[]] * 8 + [["link_slow"]] * 2
     assert not any(rules([slow] * 8 + [Health(link_delay_s=0.1)] + [slow] * 8, step_s=0.05))
 
 
 FLOWN = CorridorVector(0.8, 0.0, 0.0)
+FOREIGN = CorridorVector(0.0, -1.0, 0.0)
 
 
 def sent(velocity=FLOWN, ticks=40):
@@ -128,6 +146,68 @@ def test_foreign_setpoints_between_ours_are_seen_and_a_few_accuse_nobody():
     assert first * TICK == pytest.approx(C.echo_s, abs=TICK)
     assert any(mixed(3))
     assert not any(mixed(5))
+
+
+def echoed(times_s, echo=FOREIGN, ours=FLOWN):
+    """Rules of echoes at given times, among commands of ours once a tick all the while."""
+    history, monitor, result = CommandHistory(), LoopMonitor(C), []
+    begin_s = min(times_s) - 1.0
+    for k in range(60):
+        history.add(begin_s + k * TICK, ours)
+    for time_s in times_s:
+        found = []
+        monitor.judge(Health(echo=echo, echo_time_s=time_s), history, time_s, found)
+        result.append([item.rule for item in found if item.rule == "foreign_setpoint"])
+    return result
+
+
+@pytest.mark.parametrize("start_s", [0.2, 8.0])
+def test_six_foreign_echoes_over_at_least_six_tenths_of_a_second_and_within_one(start_s):
+    def at(*after_s):
+        return [start_s + part for part in after_s]
+
+    told = ["foreign_setpoint"]
+    assert echoed(at(0.0, 0.125, 0.25, 0.375, 0.5, 0.6))[-1] == told
+    assert echoed(at(0.0, 0.125, 0.25, 0.375, 0.5, 0.59))[-1] == []
+    assert echoed(at(0.0, 0.25, 0.5, 0.75, 0.875, 1.0))[-1] == told
+    assert echoed(at(0.0, 0.25, 0.5, 0.75, 0.875, 1.001))[-1] == []
+    assert echoed(at(0.0, 0.25, 0.5, 0.75, 0.875, 1.001, 1.1))[-1] == told  # six of the last second
+    assert not any(echoed(at(0.0, 0.2, 0.4, 0.6, 0.8)))
+
+
+def test_an_echo_told_again_counts_once_and_an_older_one_not_at_all():
+    assert not any(echoed([8.0] + [8.6] * 9))
+    assert not any(echoed([8.0, 8.7, 8.1, 8.2, 8.3, 8.4, 8.75]))
+    assert not any(rules([Health(echo_time_s=9.0)] * 9))  # a time without an echo
+
+
+def test_an_echo_is_foreign_by_its_distance_in_all_three_directions():
+    times_s = [8.0 + k * TICK for k in range(20)]
+    ours = CorridorVector(0.5, -0.4, 0.3)
+    for off, foreign in ((0.14, False), (0.15, True)):  # 0.14 * sqrt(3) is 0.242, 0.15 * sqrt(3) is 0.26
+        for sign in (1, -1):
+            echo = CorridorVector(0.5 + sign * off, -0.4 - sign * off, 0.3 + sign * off)
+            assert any(echoed(times_s, echo, ours)) == foreign
+
+
+def test_a_monitor_that_was_reset_judges_like_a_new_one():
+    history = sent()
+
+    def run(monitor):
+        result = []
+        for k in range(12):
+            found = []
+            health = Health(0.06, 0.7, 0.5, boots=3 + k // 9, echo=FOREIGN, echo_time_s=8.0 + k * TICK)
+            monitor.judge(health, history, 8.0 + k * TICK, found)
+            result.append([(item.rule, item.value) for item in found])
+        return result
+
+    used = LoopMonitor(C)
+    first = run(used)
+    monitored = {rule for found in first for rule, _ in found}
+    assert monitored == {"loop_late", "link_slow", "foreign_setpoint", "autopilot_rebooted"}
+    used.reset()
+    assert run(used) == first == run(LoopMonitor(C))
 
 
 @settings(deadline=None)

@@ -186,6 +186,30 @@ def test_speed_cap_keeps_the_direction():
     assert (upward.velocity.x, upward.velocity.z) == pytest.approx((0.15, 0.25))
 
 
+def test_speed_cap_tells_how_fast_the_command_was():
+    _, told = cap_speed(command(0.9, -1.2, 0.8), 0.5, CONFIG)
+    assert (told[0].value, told[0].limit) == pytest.approx((1.7, 0.3125 * 1.7))  # 0.25 of 0.8 m/s upwards is the worst share
+
+
+@pytest.mark.parametrize("changes", [{}, {"max_horizontal_speed_m_s": 2.0, "max_vertical_speed_m_s": 1.5}])
+@pytest.mark.parametrize("wanted", [(3.0, -4.0, 0.0), (-0.1, 0.0, -2.0), (0.9, 1.2, 1.4), (2.0, 0.1, -0.2)])
+def test_speed_cap_is_the_largest_share_that_obeys_both_limits(wanted, changes):
+    chosen = config(**changes)
+    for factor in (0.25, 0.5, 0.9):
+        across = factor * chosen.max_horizontal_speed_m_s / math.hypot(*wanted[:2])
+        up = factor * chosen.max_vertical_speed_m_s / max(abs(wanted[2]), 1e-9)
+        v = cap_speed(command(*wanted), factor, chosen)[0].velocity
+        assert (v.x, v.y, v.z) == pytest.approx([min(across, up, 1.0) * part for part in wanted])
+
+
+def test_the_cap_is_what_braking_and_delay_leave_together():
+    t_s = CONFIG.dead_time_s + CONFIG.tick_s + CONFIG.lag_s
+    assert cap_factor(0.0, 0.8, CONFIG) == pytest.approx(0.8)
+    assert cap_factor(1.0, 1.0, CONFIG) == pytest.approx(t_s / (t_s + 1.0))
+    assert cap_factor(0.15, 0.8, CONFIG) == pytest.approx(0.8 * t_s / (t_s + 0.15))
+    assert cap_factor(0.15, 0.8, config(lag_s=1.0)) == pytest.approx(0.8 * 1.25 / 1.4)
+
+
 def test_speed_cap_leaves_slow_commands_alone():
     slow = command(0.6, 0, 0.25)
     assert cap_speed(slow, 0.5, CONFIG) == (slow, ())
