@@ -9,6 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 Positive = Annotated[float, Field(gt=0.0, le=1000.0)]
 NotNegative = Annotated[float, Field(ge=0.0, le=1000.0)]
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
+Remembered = Annotated[float, Field(ge=0.1, le=3.0)]
+"""A time over which samples are compared: two ticks at least, and at most what 64 samples at 20 Hz span."""
 
 
 class MonitorConfig(BaseModel):
@@ -19,7 +21,7 @@ class MonitorConfig(BaseModel):
     position_jump_m: Positive = Field(0.25, description="E1: horizontal step of the position that velocity does not explain")
     altitude_jump_m: Positive = Field(0.25, description="E9: the same, vertically")
     velocity_mismatch_m_s: Positive = Field(1.6, description="E6: mean difference of velocity and change of position")
-    velocity_window_s: Positive = Field(0.4, description="E6: time over which that mean is taken")
+    velocity_window_s: Remembered = Field(0.4, description="E6: time over which that mean is taken")
     jumps_window_s: Positive = Field(5.0, description="E1: a second jump within this time makes HOLD")
     frozen_state_s: Positive = Field(0.2, description="E2: position and velocity may stay the same in every bit this long")
     frozen_command_m_s: Positive = Field(0.3, description="E2: while at least this speed is commanded")
@@ -58,7 +60,9 @@ class MonitorConfig(BaseModel):
     echo_error_m_s: Positive = Field(
         0.25, description="K6: the autopilot's own setpoint may differ this much from all that we sent"
     )
-    echo_s: Positive = Field(0.6, description="K6: for this long; and how far back what we sent is looked for")
+    echo_s: Annotated[float, Field(gt=0.0, le=1.0)] = Field(
+        0.6, description="K6: for this long, within a second; and how far back what we sent is looked for"
+    )
     battery_low: Share = Field(0.15, description="V6: charge below which the flight ends in HOLD (PX4: BAT_LOW_THR)")
     battery_critical: Share = Field(0.07, description="V6: charge below which the vehicle lands (PX4: BAT_CRIT_THR)")
 
@@ -66,7 +70,7 @@ class MonitorConfig(BaseModel):
     nominal_scan_age_s: Positive = Field(0.12, description="A3: age of the scan from which on the cap falls")
     nominal_late_s: Positive = Field(0.02, description="A3: lateness of the tick from which on the cap falls")
     nominal_link_delay_s: Positive = Field(0.1, description="A3: round trip from which on the cap falls")
-    braking_horizon_s: Positive = Field(0.6, description="A1: motion is compared with what was expected this long ago")
+    braking_horizon_s: Remembered = Field(0.6, description="A1: motion is compared with what was expected this long ago")
     braking_memory_s: Positive = Field(2.0, description="A1: time constant with which braking seen is forgotten")
     braking_weak: Share = Field(0.9, description="A1: share of the expected slowing down from which on the cap falls")
     braking_healthy: Share = Field(1.0, description="A1: share from which on it rises again")

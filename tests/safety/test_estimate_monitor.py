@@ -188,9 +188,16 @@ def test_after_a_step_velocity_and_position_are_compared_anew(rule):
     assert [len(found) for found in rules(drifting)] == [int(k == 15) for k in range(30)]
 
 
+def test_the_longest_window_allowed_still_fills():
+    """Longer ones need more samples than are kept, and would never tell anything."""
+    longest = MonitorConfig(velocity_window_s=3.0, position_jump_m=5.0)
+    drift = [state(5.0 + 2.0 * k * STEP, time_s=8.0 + k * STEP) for k in range(70)]
+    assert rules(drift, config=longest)[-1] == ["velocity_mismatch"]
+
+
 def test_a_step_of_exactly_the_limit_is_accepted():
     """Numbers that are exact in binary."""
-    exact = MonitorConfig(position_jump_m=0.25, altitude_jump_m=0.25, velocity_mismatch_m_s=1.0, velocity_window_s=5.0)
+    exact = MonitorConfig(position_jump_m=0.25, altitude_jump_m=0.25, velocity_mismatch_m_s=1.0, velocity_window_s=3.0)
     limit = 0.25 + STEP
     for shift in ((limit, 0, 0), (0, -limit, 0), (0, 0, limit), (0, 0, -limit)):
         pair = [state(4.0, 0.0, 2.0), state(4.0 + shift[0], shift[1], 2.0 + shift[2], time_s=STEP)]
