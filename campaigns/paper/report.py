@@ -62,8 +62,8 @@ def markdown(table: dict[str, Any], command: str) -> str:
     seeds = len(table["rows"]["final_return"]["ours"][first]["seeds"])
     lines += [
         "",
-        f"Here: mean over {seeds} seeds, lowest and highest in brackets; p of an exact permutation test over seeds, which cannot be "
-        f"below {2.0 / math.comb(2 * seeds, seeds):.2g} with so many.",
+        f"Here: mean over {seeds} seeds, lowest and highest in brackets; p of an exact permutation test over seeds, which cannot "
+        f"be below {2.0 / math.comb(2 * seeds, seeds):.2g} with so many.",
         "",
     ]
     lines += [f"- {MEASURES[name][0]}: {note}." for name, note in NOTES.items()]
