@@ -16,6 +16,7 @@ LIST_DEADLINE_S = 15.0
 DOWNLOAD_DEADLINE_S = 600.0
 STALL_S = 20.0
 MAX_BYTES = 2 * 1024**3
+CANCEL_S = 2.0
 POLL_S = 0.05
 FILE_NAME = "px4.ulg"
 
@@ -85,6 +86,7 @@ def _download(plugin: Any, entry: Any, target: Path, stopped: Callable[[], bool]
         return f"PX4 log: {target} ({entry.size_bytes} bytes)"
     if not answer.done.is_set():
         plugin.cancel_download_log_file()
+        answer.done.wait(CANCEL_S)  # MAVSDK calls back once more: after the plugin is gone that would be into freed memory
         answer.result = "stopped by a signal" if stopped() else "too slow"
     target.unlink(missing_ok=True)
     return f"no PX4 log: download failed ({answer.result.lower().replace('_', ' ')}); copy it from the vehicle's card"
