@@ -15,6 +15,7 @@ from typing import Any
 from campaigns.adversaries.report import section
 from campaigns.clients.report import markdown as client_tables
 from campaigns.command_line import run_command
+from campaigns.evaluation_table import commands, evaluation_table
 from campaigns.faults.report import markdown as fault_table
 from campaigns.price import markdown as price_table
 from campaigns.process_death import markdown
@@ -54,27 +55,9 @@ def read_results(folder: Path = RESULTS) -> dict[str, dict[str, Any]]:
     return results
 
 
-def rate(p: dict[str, Any]) -> str:
-    """A proportion with its interval."""
-    return f"{100 * p['rate']:.1f} % ({100 * p['low']:.1f} to {100 * p['high']:.1f} %, n = {p['n']})"
-
-
-def lockstep_rows(results: dict[str, dict[str, Any]], weights: str | None = None) -> list[tuple[str, str, str]]:
-    """(what, figure, command) of every lockstep evaluation, of one policy only when the digest of its weights is given."""
-    rows = []
-    for result in results.values():
-        if "split" not in result or (weights is not None and result["weights_sha256"] != weights):
-            continue
-        n, split, safety = result["clean_success"]["n"], result["split"], "on" if result["safety"] else "off"
-        dynamics = result["dynamics"]
-        how, option = ("lockstep", "") if dynamics == "internal" else (f"{dynamics} dynamics", f" --dynamics {dynamics}")
-        what = f"`{Path(result['policy']).stem}`: clean success, `{split}`, safety {safety}, {how}: {result['description']}"
-        figure = f"{rate(result['clean_success'])}; path efficiency {result['path_efficiency']:.3f}"
-        if result["clean_arrival"]["rate"] != result["clean_success"]["rate"]:
-            figure += f"; arrived cleanly by its own estimate: {rate(result['clean_arrival'])}"
-        command = f"evaluate-policy {result['policy']} --split {split} --episodes {n} --safety {safety}{option}"
-        rows.append((what, figure, command))
-    return rows
+def evaluations(results: dict[str, dict[str, Any]], weights: str | None = None) -> list[dict[str, Any]]:
+    """Every lockstep evaluation, of one policy only when the digest of its weights is given."""
+    return [one for one in results.values() if "split" in one and weights in (None, one["weights_sha256"])]
 
 
 def realtime_rows(results: dict[str, dict[str, Any]]) -> list[tuple[str, str, str]]:
@@ -133,7 +116,8 @@ def model_card(file: PolicyFile, path: Path, results: dict[str, dict[str, Any]])
         "",
     ]
     lines += ["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in facts), ""]
-    lines += ["## Results", "", table(lockstep_rows(results, meta.weights_sha256)), ""]
+    measured = evaluations(results, meta.weights_sha256)
+    lines += ["## Results", "", evaluation_table(measured), "", commands(measured), ""]
     return "\n".join([*lines, trained_on(load_config(preset, TrainingConfig).environment)])
 
 
@@ -170,8 +154,7 @@ def publish() -> None:
     results = read_results()
     for path in sorted(POLICIES.glob("*.onnx")):
         path.with_suffix(".md").write_text(model_card(read_policy_file(path), path, results))
-    note = f"The article: {PAPER_UNSEEN_SUCCESS} success in unseen worlds (31 flights), path efficiency {PAPER_PATH_EFFICIENCY}."
-    _write_block(README, BEGIN, END, f"{table(lockstep_rows(results) + realtime_rows(results))}\n\n{note}")
+    _write_block(README, BEGIN, END, results_block(results))
     if "process_death" in results:
         _write_block(SAFETY, *PROCESS_DEATH, process_death(results["process_death"]))
     if "mutation" in results or "accidents" in results:
@@ -186,6 +169,13 @@ def publish() -> None:
     _write_block(GATEWAY, *FAULT_KINDS, fault_kinds())
     if "clients" in results:
         _write_block(GATEWAY, *CLIENTS, client_tables(results["clients"]))
+
+
+def results_block(results: dict[str, dict[str, Any]]) -> str:
+    """README's section: the policies in lockstep, the article's figures, the flights in real time."""
+    note = f"The article: {PAPER_UNSEEN_SUCCESS} success in unseen worlds (31 flights), path efficiency {PAPER_PATH_EFFICIENCY}."
+    flown = evaluations(results)
+    return "\n\n".join([evaluation_table(flown), note, commands(flown), table(realtime_rows(results))])
 
 
 def fault_campaign(result: dict[str, Any]) -> str:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from campaigns.publish import lockstep_rows, publish, read_results, trained_on
+from campaigns.evaluation_table import commands, evaluation_table
+from campaigns.publish import evaluations, publish, read_results, trained_on
 from training.config import EnvironmentConfig
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -27,17 +28,20 @@ def test_readme_and_model_cards_are_what_the_results_say(tmp_path: Path, monkeyp
 def evaluation(split: str, dynamics: str) -> dict[str, object]:
     rate = {"rate": 0.9, "low": 0.8, "high": 0.95, "n": 50}
     where = {"policy": "p.onnx", "weights_sha256": "w", "split": split, "dynamics": dynamics, "safety": True, "description": "d"}
-    return where | {"clean_success": rate, "clean_arrival": rate, "path_efficiency": 0.95}
+    return where | {"clean_success": rate, "clean_arrival": rate, "path_efficiency": 0.95, "failures": {"wall": [1, 2]}}
 
 
 def test_a_file_of_several_evaluations_gives_a_row_each_with_its_command(tmp_path: Path) -> None:
-    (tmp_path / "splits.json").write_text(json.dumps([evaluation("unseen", "internal"), evaluation("wind", "jsbsim")]))
-    (what, figure, command), (other, _, jsbsim) = lockstep_rows(read_results(tmp_path), "w")
-    assert "`unseen`, safety on, lockstep" in what
-    assert "90.0 %" in figure
-    assert command == "evaluate-policy p.onnx --split unseen --episodes 50 --safety on"
-    assert "`wind`, safety on, jsbsim dynamics" in other
-    assert jsbsim.endswith("--safety on --dynamics jsbsim")
+    (tmp_path / "splits.json").write_text(json.dumps([evaluation("wind", "jsbsim"), evaluation("unseen", "internal")]))
+    found = evaluations(read_results(tmp_path), "w")
+    unseen, wind = evaluation_table(found).splitlines()[2:]
+    assert unseen == "| `p` | `unseen` | on | six degrees of freedom | 90.0 % (80.0 to 95.0) of 50 | 90.0 % | 0.950 | `wall` 2 |"
+    assert "| `wind` | on | JSBSim |" in wind
+    assert commands(found).splitlines()[1:-1] == [
+        "evaluate-policy p.onnx --split unseen --episodes 50 --safety on",
+        "evaluate-policy p.onnx --split wind --episodes 50 --safety on --dynamics jsbsim",
+    ]
+    assert evaluations(read_results(tmp_path), "other weights") == []
 
 
 def test_every_shipped_policy_has_a_card_with_results() -> None:
