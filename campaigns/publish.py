@@ -19,6 +19,7 @@ from campaigns.evaluation_table import commands, evaluation_table
 from campaigns.faults.report import markdown as fault_table
 from campaigns.price import markdown as price_table
 from campaigns.process_death import markdown
+from campaigns.safety_summary import safety_rows
 from campaigns.strength import strength
 from policy_export.errors import PolicyError
 from policy_export.policy_file import PolicyFile, read_policy_file
@@ -172,10 +173,10 @@ def publish() -> None:
 
 
 def results_block(results: dict[str, dict[str, Any]]) -> str:
-    """README's section: the policies in lockstep, the article's figures, the flights in real time."""
+    """README's section: the policies in lockstep, the article's figures, the flights in real time, the safety layer."""
     note = f"The article: {PAPER_UNSEEN_SUCCESS} success in unseen worlds (31 flights), path efficiency {PAPER_PATH_EFFICIENCY}."
     flown = evaluations(results)
-    return "\n\n".join([evaluation_table(flown), note, commands(flown), table(realtime_rows(results))])
+    return "\n\n".join([evaluation_table(flown), note, commands(flown), table(realtime_rows(results) + safety_rows(results))])
 
 
 def fault_campaign(result: dict[str, Any]) -> str:

@@ -10,6 +10,7 @@ import pytest
 
 from campaigns.evaluation_table import commands, evaluation_table
 from campaigns.publish import evaluations, publish, read_results, trained_on
+from campaigns.safety_summary import safety_rows
 from training.config import EnvironmentConfig
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,3 +59,10 @@ def test_a_card_says_whether_anything_moved_in_training() -> None:
     assert "in 25% of the corridors" in moving
     assert "up to 0.6 m/s" in moving
     assert "Never on moving obstacles" not in moving
+
+
+def test_a_safety_campaign_gives_its_row_with_the_command_that_made_it() -> None:
+    deaths = {"command": "c", "good": 78, "runs": 79, "late_moving_setpoints": 1, "contacts": 2}
+    ((_, figure, command),) = safety_rows({"process_death": deaths, "another": {}})
+    assert figure == "78 of 79 good: 1 moving setpoints more than 150 ms later, 2 contacts"
+    assert command == "c"
