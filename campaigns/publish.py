@@ -76,7 +76,8 @@ def realtime_rows(results: dict[str, dict[str, Any]]) -> list[tuple[str, str, st
         median, tail = result["scan_to_setpoint_ms_p50"], result["scan_to_setpoint_ms_p99_worst"]
         timing = (
             f"{loop['mean']:.3f} Hz mean, {loop['worst']:.3f} Hz worst flight; {result['deadline_misses']} of {result['ticks']} "
-            f"ticks late; {median:.0f} ms median, {tail:.0f} ms worst p99"
+            f"ticks late; {median:.0f} ms median, {tail:.0f} ms worst p99; "
+            f"load average of the machine {result['load_average_at_end']:.1f}"
         )
         rows.append(("loop rate; deadline misses; scan to setpoint, same flights", timing, "same"))
     return rows

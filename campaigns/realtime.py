@@ -102,7 +102,7 @@ def summarise(mission: Path, flights: list[RealFlight]) -> dict[str, Any]:
     """All flights as one JSON-able object."""
     loops = [f.loop for f in flights if f.loop]
     return {
-        "command": "python -m campaigns.realtime " + " ".join(sys.argv[1:]),
+        "command": f"{_priority()}python -m campaigns.realtime {' '.join(sys.argv[1:])}",
         "mission": str(mission),
         "flights": len(flights),
         "goal_reached_and_landed": sum(f.exit_code == 0 for f in flights),
@@ -122,6 +122,11 @@ def summarise(mission: Path, flights: list[RealFlight]) -> dict[str, Any]:
         "load_average_at_end": os.getloadavg()[0],
         "each": [asdict(f) | {"clean": f.clean} for f in flights],
     }
+
+
+def _priority() -> str:
+    """How the command was started, where it was not started plainly."""
+    return f"nice -n {os.nice(0)} " if os.nice(0) else ""
 
 
 def main() -> int:
