@@ -27,7 +27,9 @@ def test_inside_a_square_the_margin_is_to_the_nearest_wall(x, y):
     assert PolygonFence(SQUARE, ()).signed_margin_m(np.array((x - 4.0, y))) == x - 4.0
 
 
-@pytest.mark.parametrize("place", [(4.0, 2.0), (0.0, 2.0), (2.0, 0.0), (2.0, 4.0), (0.0, 0.0), (4.0, 4.0), (4.0, 0.0), (0.0, 4.0)])
+@pytest.mark.parametrize(
+    "place", [(4.0, 2.0), (0.0, 2.0), (2.0, 0.0), (2.0, 4.0), (0.0, 0.0), (4.0, 4.0), (4.0, 0.0), (0.0, 4.0)]
+)
 def test_right_on_an_edge_there_is_no_margin_and_nothing_is_divided_by_it(place):
     with np.errstate(all="raise"):
         assert PolygonFence(SQUARE, ()).signed_margin_m(np.array(place)) == 0.0
