@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -33,6 +34,30 @@ def test_inside_a_square_the_margin_is_to_the_nearest_wall(x, y):
 def test_right_on_an_edge_there_is_no_margin_and_nothing_is_divided_by_it(place):
     with np.errstate(all="raise"):
         assert PolygonFence(SQUARE, ()).signed_margin_m(np.array(place)) == 0.0
+
+
+def exactly_inside(place: tuple[float, float], ring: Ring) -> bool:
+    """In rational numbers: an odd number of edges lies to the east."""
+    x, y = map(Fraction, place)
+    corners = [tuple(map(Fraction, vertex)) for vertex in ring]
+    edges = zip(corners, (*corners[1:], corners[0]), strict=True)
+    return sum((ay <= y) != (by <= y) and x < ax + (bx - ax) * (y - ay) / (by - ay) for (ax, ay), (bx, by) in edges) % 2 == 1
+
+
+@pytest.mark.parametrize(
+    ("ring", "place"),
+    [
+        (((-0.8, -4.1), (-0.8, -5.3), (5.4, -3.9)), (math.nextafter(-0.8, 0.0), -4.1)),
+        (((-3.6, -1.2), (-0.3, 2.9), (-2.2, -3.4)), (math.nextafter(-3.6, 0.0), -1.2)),
+        (((-1.5, -3.6), (-3.3, -2.2), (4.8, -1.5)), (math.nextafter(-1.5, 0.0), -3.6)),
+        (((5.0, 2.4), (0.8, 2.9), (1.0, -5.8)), (5.0, math.nextafter(2.4, 0.0))),
+    ],
+)
+def test_the_last_bit_beside_a_corner_tells_the_side(ring, place):
+    """Rounding puts these right on the line of one edge; the others to the east still tell."""
+    margin_m = float(PolygonFence(ring, ()).signed_margin_m(np.array(place)))
+    assert (margin_m > 0.0) == exactly_inside(place, ring)
+    assert 0.0 < abs(margin_m) < 1e-15
 
 
 def test_right_on_a_slanted_edge_its_own_erosion_is_missing():
