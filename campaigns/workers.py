@@ -8,7 +8,8 @@ import socket
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children, get_context, parent_process
+from threading import Thread
 from typing import Any, TypeVar
 
 from campaigns.errors import ClusterError
@@ -21,9 +22,10 @@ CONNECT_TIMEOUT_S = 5.0
 
 @contextmanager
 def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """New processes for the block. A block that ends by an exception or Ctrl-C ends them at once, with all that still waits."""
+    """New processes for the block. One that ends by an exception or Ctrl-C ends them at once, with all that still waits; a parent
+    that is killed takes them with it."""
     others = set(active_children())
-    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_leave_ctrl_c_to_the_parent)
+    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_follow_the_parent)
     try:
         yield pool
     except BaseException:
@@ -34,8 +36,17 @@ def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
     pool.shutdown()
 
 
-def _leave_ctrl_c_to_the_parent() -> None:
+def _follow_the_parent() -> None:
+    """Leave Ctrl-C to the parent, and end when it has ended: otherwise the same command, given again, would meet its own past."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_after_the_parent, daemon=True).start()
+
+
+def _end_after_the_parent() -> None:
+    parent = parent_process()
+    assert parent is not None, "runs in a child only"
+    parent.join()
+    os._exit(1)
 
 
 def over_processes(function: Callable[[int], Result], count: int, workers: int | None = None) -> Iterator[tuple[int, Result]]:

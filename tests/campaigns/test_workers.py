@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from multiprocessing import active_children
 from pathlib import Path
 
@@ -33,6 +34,20 @@ def test_who_stops_asking_waits_for_nobody() -> None:
         child.join(10.0)
     assert not active_children()
     assert time.monotonic() - began < 10.0
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_a_parent_that_is_killed_takes_them_with_it(how: signal.Signals) -> None:
+    parent = subprocess.Popen([sys.executable, "-c", BUSY], cwd=ROOT, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert parent.stdout is not None
+    try:
+        assert int(parent.stdout.readline()) < 3
+        parent.send_signal(how)
+        rest, _ = parent.communicate(timeout=20.0)  # they share its output, which ends with the last of them
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(parent.pid, signal.SIGKILL)
+    assert (rest, parent.returncode) == ("", -how)
 
 
 @pytest.mark.parametrize("to_all", [False, True], ids=["by kill", "at the terminal"])
