@@ -113,9 +113,7 @@ def blind(time_s: float, x_m: float = 0.05, y_m: float = 0.05) -> SeenScan:
     return taken(time_s, x_m, y_m, np.zeros(81))
 
 
-@pytest.mark.parametrize(
-    ("moved", "corner"), [(0, 0), (7, 0), (8, 8), (15, 8), (16, 16), (-7, 0), (-8, -8), (-9, -8), (-16, -16)]
-)
+@pytest.mark.parametrize(("moved", "corner"), [(0, 0), (7, 0), (8, 8), (15, 8), (16, 16), (-7, 0), (-8, -8), (-9, -8)])
 def test_the_map_follows_in_steps_of_eight_cells(moved, corner):
     free = FreeSpace(config())
     free.update(blind(0.0))
@@ -204,7 +202,7 @@ def test_a_long_pause_shrinks_by_no_more_than_the_map_is_wide():
 
 
 def test_the_unseen_grows_from_all_sides_and_each_row_at_the_end_stays():
-    """One unseen cell in a map that is seen: after k steps a square of 2 k + 1 cells; what enters an end row does not spread there."""
+    """One unseen cell in a map that is seen: after k steps a square of 2 k + 1 cells, but for the end rows."""
     free = FreeSpace(config(obstacle_speed_m_s=1.0))
     free.update(blind(0.0))
     free._seen_s.fill(1.0)

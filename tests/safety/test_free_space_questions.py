@@ -1,4 +1,4 @@
-"""What is asked of the map of free space: counts, quick looks, gaps and patches, against looking at every cell of a random map."""
+"""What is asked of the map of free space: counts, quick looks, gaps, patches; against looking at every cell of a random map."""
 
 from __future__ import annotations
 

@@ -28,8 +28,8 @@ def shown_by(free_m, increment_rad: float, yaw_rad: float = 0.0, first_rad: floa
 def expected(seen: SeenScan) -> dict[tuple[int, int], bool]:
     """Cells that must or must not be free, for beams that divide a turn; none where rounding decides which beam is the nearest.
 
-    All beams must reach the far corner that may look at the cell: as many on either side of its bearing as its far corner is wide,
-    and one, rounded up to a power of two. There is nothing where no beam is.
+    All beams must reach the far corner that may look at the cell: as many on either side of its bearing as that is wide, and one,
+    rounded up to a power of two. There is nothing where no beam is.
     """
     increment, turn = seen.angle_increment_rad, round(2.0 * math.pi / seen.angle_increment_rad)
     reach = dict(enumerate(seen.free_m.tolist()))
