@@ -157,6 +157,7 @@ def shown(share: float, monitor: MotionMonitor | None = None) -> MotionMonitor:
 def test_the_cap_falls_below_the_weak_share_and_is_never_negative():
     assert shown(0.9).cap == 1.0
     assert shown(math.nextafter(0.9, 0.0)).cap == math.nextafter(0.9, 0.0)
+    assert shown(0.95).cap == 1.0
     assert shown(-0.3).cap == 0.0
     assert shown(1.0, shown(0.8)).cap == 1.0
     assert shown(math.nextafter(1.0, 0.0), shown(0.8)).cap == math.nextafter(1.0, 0.0)
@@ -174,7 +175,7 @@ def failing(share: float, failed_s: float) -> list[tuple[str, float, float]]:
 
 def test_failing_longer_than_half_a_second_is_told():
     just = 0.5 + ROUNDING_S
-    assert failing(0.6, just) == []
+    assert failing(0.6, just) == failing(0.6, 0.3) == []
     assert failing(0.6, math.nextafter(just, 1.0)) == [("braking_weak", pytest.approx(0.6), 0.7)]
     assert failing(0.71, 9.0) == []
 
@@ -187,23 +188,31 @@ def test_a_share_of_exactly_what_fails_does_not_fail():
 
 
 def test_only_ticks_of_braking_count_as_failing():
-    """At 1 m/s, zero sent: the second tick finds no sample that is old enough, the third does, 0.3 s after the second."""
+    """Zero sent at 1 m/s: the second tick has no sample that is old enough, the third has; in the next none was expected."""
     monitor = judged((0.0, 1.0, 0.0), (0.4, 1.0, 0.0))
     monitor._seen, monitor._expected = 0.1, 5.0
     monitor.judge(state(v=(1.0, 0.0, 0.0), time_s=0.5), sent((-1.0, 0.0, 0.0)), [])
     assert monitor._failed_s == 0.0
     monitor.judge(state(v=(1.0, 0.0, 0.0), time_s=0.8), sent((-1.0, 0.0, 0.0)), [])
     assert monitor._failed_s == pytest.approx(0.3)
+    monitor.judge(state(v=(1.0, 0.0, 0.0), time_s=0.85), sent((-1.0, 1.0, 0.0)), [])
+    assert monitor._failed_s == pytest.approx(0.3)
     monitor._seen = 5.0
     monitor.judge(state(v=(1.0, 0.0, 0.0), time_s=0.9), sent((-1.0, 0.0, 0.0)), [])
     assert monitor._failed_s == 0.0
 
 
+def test_better_braking_than_assumed_allows_no_more_than_the_limit():
+    monitor = MotionMonitor(CONFIG)
+    monitor._seen, monitor._expected, monitor._weak = 1.5, 1.0, True
+    assert monitor.cap == 1.0
+
+
 def test_the_course_is_a_low_pass_of_what_was_sent():
-    monitor = judged((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), history=sent((-1.0, 0.8, -0.4)))
-    share = 1.0 - math.exp(-0.3 / 0.6)
+    monitor = judged((0.0, 0.0, 0.0), (0.6, 0.0, 0.0), history=sent((-1.0, 0.8, -0.4)))
+    share = 1.0 - math.exp(-1.0)
     assert monitor._course == pytest.approx((0.8 * share, -0.4 * share))
-    monitor.judge(state(time_s=0.5), sent((0.4, -0.2, 0.6)), [])
+    monitor.judge(state(time_s=0.8), sent((0.4, -0.2, 0.6)), [])
     rest = math.exp(-0.2 / 0.6)
     assert monitor._course == pytest.approx((-0.2 + (0.8 * share + 0.2) * rest, 0.6 + (-0.4 * share - 0.6) * rest))
 

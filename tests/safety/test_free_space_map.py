@@ -9,7 +9,7 @@ import pytest
 from safety_plant import config
 
 from safety.config import Fence
-from safety.free_space import SIDE_CELLS, FreeSpace, _ViewTemplate
+from safety.free_space import SIDE_CELLS, FreeSpace, _overlap, _sagitta_m, _ViewTemplate
 from safety.lidar import SeenScan
 from safety.unseen_cells import boxes_within, cells_in
 
@@ -211,6 +211,29 @@ def test_the_unseen_grows_from_all_sides_and_each_row_at_the_end_stays():
     unseen = {(int(i), int(j)) for i, j in zip(*np.nonzero(np.isinf(free._seen_s)), strict=True)}
     assert unseen == {(i, j) for i in range(1, 8) for j in range(56, 65)}
     assert free._shrunk_s == pytest.approx(0.4)
+
+
+def test_a_whole_second_at_a_metre_per_second_is_ten_cells():
+    """Although a tenth, as a number, is a little more than a tenth."""
+    free = FreeSpace(config(obstacle_speed_m_s=1.0))
+    free.update(blind(0.0))
+    free._shrink(1.0)
+    assert free._shrunk_s == pytest.approx(1.0)
+
+
+def test_discs_of_half_a_step_leave_all_of_their_radius():
+    assert _sagitta_m(config(vehicle_radius_m=0.1)) == 0.1
+    assert _sagitta_m(config(vehicle_radius_m=0.02)) == 0.02
+
+
+@pytest.mark.parametrize("step", [-127, -64, -8, -1, 1, 8, 64, 127])
+def test_what_two_maps_share_is_as_long_in_both(step):
+    target, source = _overlap(step)
+    cells = range(SIDE_CELLS)
+    assert [cell + step for cell in cells[target]] == list(cells[source])
+    assert len(cells[target]) == SIDE_CELLS - abs(step)
+    assert min(target.start, source.start, target.stop, source.stop) >= 0
+    assert max(target.stop, source.stop) == SIDE_CELLS
 
 
 def test_a_scan_drops_what_was_known_of_returns():

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from safety_plant import config
 
-from safety.free_space import SIDE_CELLS, FreeSpace
+from safety.free_space import NOWHERE, SIDE_CELLS, FreeSpace
 from safety.unseen_cells import boxes_within
 
 HULL_M = 0.35 + 0.05 + 0.05 * 0.85 + 0.014590
 WIDE, EXACT = boxes_within(HULL_M + 0.1).tolist(), boxes_within(HULL_M).tolist()
 RIM = 6  # cells: 0.557 m reach five cells and a part of the sixth
 NOTHING = np.empty((2, 0))
-BEGAN_S, MEMORY_S = 32.0, 4.0
+BEGAN_S, MEMORY_S = 3.0, 4.0
 
 
 def random_map(chance: np.random.Generator, unseen: float) -> FreeSpace:
@@ -88,13 +88,23 @@ def test_two_spared_places_spare_both(wide):
     assert free.unseen(places, NOTHING, BEGAN_S, wide, places[:, :0]).tolist() == [first[1]] * 2
 
 
+def test_sums_are_kept_for_the_next_question_where_nothing_is_spared():
+    free = random_map(np.random.default_rng(0), 1.0)
+    places = places_at(free, np.full((2, 1), 60), np.random.default_rng(1))
+    assert NOWHERE.shape == (2, 0)
+    free.unseen(places, NOTHING, BEGAN_S, wide=True, spared_m=places)
+    assert not free._patches[BEGAN_S].counts
+    free.unseen(places, NOTHING, BEGAN_S, wide=True)
+    assert list(free._patches[BEGAN_S].counts) == [True]
+
+
 def test_a_seen_map_counts_nothing_in_the_shape_of_the_places():
     free = random_map(np.random.default_rng(1), 0.0)
     places = places_at(free, np.full((2, 3, 4), 50), np.random.default_rng(2))
     assert np.array_equal(free.unseen(places, NOTHING, BEGAN_S, wide=True), np.zeros((3, 4)))
 
 
-ENDS = [(RIM, True), (RIM - 1, False), (SIDE_CELLS - 1 - RIM, True), (SIDE_CELLS - RIM, False)]
+ENDS = [(RIM, True), (RIM - 1, False), (2, False), (SIDE_CELLS - 1 - RIM, True), (SIDE_CELLS - RIM, False), (125, False)]
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -102,17 +112,17 @@ ENDS = [(RIM, True), (RIM - 1, False), (SIDE_CELLS - 1 - RIM, True), (SIDE_CELLS
 def test_a_hull_that_leaves_the_map_touches_the_unseen(axis, cell, on_the_map):
     """All is seen; the hull's rim of six cells ends with the map, or one cell beyond it."""
     chance = np.random.default_rng(5)
-    free, cells = random_map(chance, 0.0), np.full((2, 2), 64)
+    free, cells = random_map(chance, 0.0), np.full((2, 3), 64)
     cells[axis, 1] = cell
     places = places_at(free, cells, chance)
     x, y = places[:, 1].tolist()
     low, high = places.min(axis=1).tolist(), places.max(axis=1).tolist()
-    assert free.unseen(places, NOTHING, BEGAN_S, wide=True).tolist() == ([0, 0] if on_the_map else [SIDE_CELLS**2] * 2)
+    assert free.unseen(places, NOTHING, BEGAN_S, wide=True).tolist() == ([0] * 3 if on_the_map else [SIDE_CELLS**2] * 3)
     assert free.all_seen_around(x, y, BEGAN_S) == on_the_map
     assert free.all_seen_between(low, high, BEGAN_S) == on_the_map
     assert free.none_hidden(low, high, NOTHING, BEGAN_S) == on_the_map
     gaps = free.gap_m(places, NOTHING, BEGAN_S).tolist()
-    assert gaps == (pytest.approx([0.1 * RIM] * 2) if on_the_map else [0.0, 0.0])
+    assert gaps == (pytest.approx([0.1 * RIM] * 3) if on_the_map else [0.0] * 3)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -154,6 +164,20 @@ def test_quick_looks_agree_with_every_cell(seed):
     at_odd = places_at(free, odd[:, None], chance)
     assert free.none_hidden(begin, end, at_odd, BEGAN_S + 9.5)
     assert free.all_seen_between(begin, end, BEGAN_S + 9.5) != inside
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("end", "inside"), [(-RIM, True), (-RIM - 1, False), (RIM, True), (RIM + 1, False)])
+@pytest.mark.parametrize("cell", [50, 61])
+def test_quick_looks_end_with_the_rim(axis, end, inside, cell):
+    free = random_map(np.random.default_rng(4), 0.0)
+    free._seen_s.fill(6.0)
+    odd = [cell, cell]
+    odd[axis] += end
+    free._seen_s[*odd] = -np.inf
+    place = [0.1 * (corner + cell + 0.5) for corner in free._corner]
+    assert free.all_seen_around(*place, BEGAN_S) != inside
+    assert free.none_hidden((*place, 1.0), (*place, 2.0), NOTHING, BEGAN_S) != inside
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -199,6 +223,7 @@ def test_a_patch_is_twelve_cells_wider_than_what_is_asked_first():
     left, below = free._corner
     assert (patch.known.low_x, patch.known.low_y, patch.hidden.shape) == (left + 38, below + 48, (32, 27))
     assert patch.known.mask.shape == patch.hidden.shape
+    assert patch.hidden.dtype == np.bool_
     assert free._patch_of(window(free, (38, 48), (70, 75)), NOTHING, BEGAN_S) is patch
     again = free._patch_of(window(free, (37, 48), (70, 75)), NOTHING, BEGAN_S)
     assert again is not patch

@@ -168,13 +168,14 @@ def test_a_near_return_has_its_far_side_no_further_than_twice_as_far():
 def test_age_drift_and_motion_add_to_the_spread():
     """At 0.05 m/s of velocity error drift ends at twice the position error; an obstacle's own motion ends after a second."""
     memory = ObstacleMemory()
-    memory.update(ALONG, 5.0, C)
-    quick = config(obstacle_speed_m_s=0.4)
+    memory.update(replace(ALONG, time_s=8.0), 5.0, C)
+    quick, quicker = config(obstacle_speed_m_s=0.4), config(obstacle_speed_m_s=1.0)
     for age_s, drift_m, moved_m in ((-0.5, 0.0, 0.0), (0.5, 0.025, 0.2), (1.0, 0.05, 0.4), (1.5, 0.075, 0.4), (3.0, 0.1, 0.4)):
-        x, y, extra = memory.points(age_s, C)
+        x, y, extra = memory.points(8.0 + age_s, C)
         assert (x.tolist(), y.tolist()) == ([2.0], [0.0])
         assert extra.tolist() == pytest.approx([0.01 + drift_m])
-        assert memory.points(age_s, quick)[2].tolist() == pytest.approx([0.01 + drift_m + moved_m])
+        assert memory.points(8.0 + age_s, quick)[2].tolist() == pytest.approx([0.01 + drift_m + moved_m])
+        assert memory.points(8.0 + age_s, quicker)[2].tolist() == pytest.approx([0.01 + drift_m + 2.5 * moved_m])
 
 
 def ring(count: int, time_s: float, away_m: float) -> SeenScan:

@@ -91,6 +91,14 @@ def test_a_beam_that_ends_at_the_far_corner_shows_the_cell():
         assert free[HALF + 10, HALF] == is_free
 
 
+def test_a_beam_that_ends_exactly_at_the_far_corner_shows_the_cell():
+    view, ahead = _ViewTemplate(HALF), (HALF + 10, HALF)
+    view.visible(shown_by(np.full(360, 3.0), math.pi / 180.0), ALL)
+    exact = view._needed_m[ahead]
+    for reach_m, is_free in ((exact, True), (np.nextafter(exact, np.float32(0.0)), False)):
+        assert view.visible(shown_by(np.full(360, float(reach_m)), math.pi / 180.0), ALL)[ahead] == is_free
+
+
 def test_another_geometry_makes_another_template():
     """Beams of one degree, of half a degree, again of one but fewer: each time as in a new template."""
     view = _ViewTemplate(HALF)
@@ -141,6 +149,8 @@ NAN = math.nan
         ([5.0, 6.0, 5.0, NAN, 7.0], [5.0, 6.0, 5.0, 5.0, 7.0]),
         ([5.0, NAN, NAN, 8.0, 7.0], [5.0, 5.0, 8.0, 8.0, 7.0]),
         ([5.0, NAN, NAN, NAN, 7.0], [5.0, 5.0, 0.0, 7.0, 7.0]),
+        ([NAN, 6.0, 5.0, 2.0], [6.0, 6.0, 5.0, 2.0]),
+        ([2.0, 6.0, 5.0, NAN], [2.0, 6.0, 5.0, 5.0]),
     ],
 )
 def test_a_lost_beam_reaches_as_far_as_the_shorter_of_its_neighbours(free_m, expected_m):
@@ -153,6 +163,7 @@ def test_bearings_with_too_many_lost_beams_reach_nowhere(bearings):
     found = reached([5.0, NAN, 3.0, 4.0, 7.0], bearings)
     for beam, reach_m in enumerate([5.0, 3.0, 3.0, 4.0, 7.0]):
         assert found[beam] == (0.0 if beam in bearings else reach_m)
+    assert reached([5.0, NAN, NAN, NAN, 7.0], bearings)[2] == 0.0
 
 
 @pytest.mark.parametrize(("margin_rad", "lost"), [(0.0, 0), (0.04, 0), (0.06, 1), (0.14, 1), (0.16, 2), (0.24, 2), (0.26, 3)])
