@@ -130,7 +130,8 @@ def test_the_same_place_is_up_to_exactly_as_far(side):
     away_m = 0.2 if side > 0.0 else 0.4
     memory._points[:, 0], memory._count = (away_m, 0.0, 0.0, 0.0), 1
     assert abs(away_m + side * 0.2 - away_m) == 0.2
-    assert memory._kept(looking(away_m + side * 0.2, 0.0), 5.0, C).tolist() == [False]
+    kept = memory._kept(looking(away_m + side * 0.2, 0.0), 5.0, C)
+    assert (kept.tolist(), kept.dtype) == ([False], np.bool_)
     assert memory._kept(looking(away_m + side * 0.2000001, 0.0), 5.0, C).tolist() == [True]
 
 

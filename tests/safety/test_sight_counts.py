@@ -51,14 +51,15 @@ def most(view: View, places: list[np.ndarray], wide: bool, ahead_s: float, spare
 def test_counts_are_those_of_the_worst_place_of_each_tube(seed):
     """The last tube is braking's: it alone says which cells are spared, and whether anything but `soon` matters."""
     chance = np.random.default_rng(seed)
-    view, tube = random_view(chance, float(chance.choice((0.0, 0.001, 0.01)))), random_tubes(chance, 3)
+    count = 2 + seed % 3
+    view, tube = random_view(chance, float(chance.choice((0.0, 0.001, 0.01)))), random_tubes(chance, count)
     found = Sight(C).hidden(tube, view)
-    ways = [on_the_way(tube, which) for which in range(3)]
+    ways = [on_the_way(tube, which) for which in range(count)]
     soon = [most(view, way, True, AHEAD_S) for way in ways]
     assert found.soon.tolist() == soon
     if soon[-1] == 0:
         assert (found.wide.tolist(), found.exact.tolist(), found.more.tolist()) == (soon, soon, soon)
-        assert (found.gap_m.tolist(), found.brake_m.shape) == ([0.0] * 3, (2, 0))
+        assert (found.gap_m.tolist(), found.brake_m.shape) == ([0.0] * count, (2, 0))
         return
     spared = np.concatenate(ways[-1], axis=1)
     assert found.brake_m == pytest.approx(spared, abs=1e-12)
@@ -66,7 +67,8 @@ def test_counts_are_those_of_the_worst_place_of_each_tube(seed):
     assert found.exact.tolist() == [most(view, way, False, 0.0) for way in ways]
     assert found.more.tolist() == [most(view, way, False, AHEAD_S, spared) for way in ways]
     gaps = [
-        min(float(view.free.gap_m(tube.stop_m[k, which, :2, None], view.near_m, NOW_S)[0]) for k in (0, 1)) for which in range(3)
+        min(float(view.free.gap_m(tube.stop_m[k, which, :2, None], view.near_m, NOW_S)[0]) for k in (0, 1))
+        for which in range(count)
     ]
     assert found.gap_m == pytest.approx(gaps, abs=1e-12)
 
@@ -121,6 +123,7 @@ BRAKE = counted(5, 4, 3, 9, 0.2)
         ({}, True), ({"wide": 5}, False), ({"exact": 4}, False), ({"more": 1}, False), ({"gap_m": 0.2 - 1e-9}, True),
         ({"gap_m": 0.2 - 2e-9}, False), ({"wide": 3, "exact": 2, "gap_m": 0.6}, True), ({"soon": 1}, True), ({"soon": 99}, True),
         ({"soon": 0, "wide": 9, "exact": 9, "more": 9, "gap_m": 0.0}, True), ({"more": -1}, False),
+        ({"soon": -1, "more": 1}, False),
     ],
 )  # fmt: skip
 def test_a_tube_may_touch_nothing_soon_or_no_more_than_braking(parts, permitted):
@@ -132,7 +135,9 @@ def test_each_tube_is_permitted_by_itself():
     rows = [counted(0, 9, 9, 9, 0.0), counted(5, 4, 3, 0, 0.2), counted(5, 4, 3, 1, 0.2), counted(5, 5, 3, 0, 0.2)]
     names = ("soon", "wide", "exact", "more", "gap_m")
     others = Hidden(*(np.concatenate([getattr(row, name) for row in rows]) for name in names), NOTHING)
-    assert BRAKE.permits(others).tolist() == [True, True, False, False]
+    permitted = BRAKE.permits(others)
+    assert permitted.tolist() == [True, True, False, False]
+    assert permitted.dtype == np.bool_
     middle = others.rows(slice(1, 3))
     assert [getattr(middle, name).tolist() for name in names] == [[5, 5], [4, 4], [3, 3], [0, 1], [0.2, 0.2]]
     assert middle.brake_m is NOTHING
@@ -168,6 +173,13 @@ def test_lost_is_judged_now_and_clear_when_the_vehicle_will_stand():
         assert view.all_seen(np.array([0.05, 0.05, 1.0]), np.array([0.05, 0.05, 1.0]), AHEAD_S) == clear
         assert view.unseen(np.array([[0.05], [0.05]]), wide=True)[0] == 0
         assert (view.unseen(np.array([[0.05], [0.05]]), True, AHEAD_S)[0] == 0) == clear
+
+
+def test_without_a_time_ahead_cells_are_counted_now():
+    """Twenty seconds of memory: seen at 0 s a cell is known at 20 s for the last time."""
+    here = np.array([[0.05], [0.05]])
+    assert seen_but(3, 0, 0.0).unseen(here, wide=True)[0] == 0
+    assert seen_but(3, 0, -0.5).unseen(here, wide=True)[0] > 0
 
 
 def test_a_box_is_clear_where_known_returns_explain_the_unseen():
