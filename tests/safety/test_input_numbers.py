@@ -121,6 +121,8 @@ def test_faults_are_told_most_severe_first_and_else_in_order():
     found = ticks.rules(1.0, state=state(time_s=1.0, roll=1.5), scan=None, command=None, health=Health(battery_fraction=0.01))
     assert found == ["tumbling", "battery_critical", "scan_missing", "command_missing"]
     assert Ticks().rules(1.0, state=None, scan=None, command=None) == ["state_missing", "scan_missing", "command_missing"]
+    two = Ticks().rules(1.0, state=state(time_s=1.0, roll=1.5), health=Health(inference_s=1.0))
+    assert two == ["tumbling", "inference_hung"]
 
 
 def test_bad_commands_count_only_where_the_samples_were_good():
@@ -183,7 +185,7 @@ def frozen(
     for k in range(repeats + 1):
         time_s = 1.0 + 0.0625 * k
         sample = state(x=5.0 + speed * time_s, v=(speed, 0.0, 0.0), yaw_rate=yaw_rate, time_s=time_s)
-        judged = ticks.judge(time_s, state=sample, scan=scan(ranges, time_s if fresh else 1.0))
+        judged = ticks.judge(time_s, state=sample, scan=scan(ranges, time_s if fresh else 1.0 + 0.0 * k))
         found = [(fault.rule, fault.value, fault.limit) for fault in judged.faults]
     return found
 
@@ -199,7 +201,11 @@ def test_a_frozen_scan_is_told_from_the_third_repeat_on_in_motion():
 def test_a_scan_that_shows_only_the_vehicle_itself_is_not_frozen():
     """A return on the hull, 0.35 m away, may be a part of the vehicle; one beyond it is not."""
     hull = np.full(20, INF)
-    for range_m, expected in ((0.35, []), (np.nextafter(np.float32(0.35), np.float32(1.0)), [("scan_frozen", 3.0, 3.0)])):
+    for range_m, expected in (
+        (0.2, []),
+        (0.35, []),
+        (np.nextafter(np.float32(0.35), np.float32(1.0)), [("scan_frozen", 3.0, 3.0)]),
+    ):
         hull[3] = range_m
         ticks = Ticks(vehicle_radius_m=float(np.float32(0.35)))
         found: list[tuple[str, float, float]] = []
@@ -239,6 +245,7 @@ def test_scans_are_alike_when_every_range_is():
     assert _alike(a, a.copy())
     assert not _alike(a, np.array([1.0, 2.0, 3.0]))
     assert not _alike(a, a[:2])
+    assert not _alike(a[:2], a)
     assert not _alike(np.array([NAN]), np.array([NAN]))
 
 
@@ -259,6 +266,36 @@ def test_the_cap_is_that_of_the_ages_beyond_the_nominal_ones(state_age_s, scan_a
     assert (late.cap, late.faults[0].rule) == (1.0, "state_missing")
     assert ticks.judge(1.02, scan=None, health=Health(lateness_s=0.04)).cap == 1.0
     assert ticks.judge(1.03, health=Health(lateness_s=0.04)).cap == pytest.approx(0.85 / 0.87)
+
+
+def test_ages_are_counted_from_a_clock_that_has_just_begun():
+    ticks = Ticks()
+    assert ticks.judge(0.13, state=state(), scan=scan()).cap == pytest.approx(0.85 / 0.9)
+    ticks = Ticks()
+    assert ticks.judge(0.22, state=state(time_s=0.22), scan=scan()).cap == pytest.approx(0.85 / 0.95)
+    assert ticks.rules(0.26, state=state(time_s=0.26), scan=scan()) == ["scan_stale"]
+
+
+def test_a_good_scan_is_compared_with_the_one_before_where_the_state_is_fit():
+    ticks = Ticks()
+    ticks.judge(1.0, scan=scan(time_s=1.0, sequence=7))
+    assert ticks.rules(1.05, state=None, scan=scan(time_s=1.05, sequence=3)) == ["state_missing"]
+    judged = ticks.judge(1.1, scan=scan(time_s=1.1, sequence=7))
+    assert [told(fault) for fault in judged.faults] == [("scan_source", 7.0, 7.0)]
+    assert judged.scan is not None
+
+
+def test_a_part_of_the_vehicle_is_taken_out_of_the_scan_and_told():
+    """L15: 0.2 m away for more than half a second of flight: unknown in the scan that is given back, with or without a state."""
+    ticks, ranges = Ticks(), np.full(180, INF)
+    ranges[90] = 0.2
+    for k in range(14):
+        time_s = 1.0 + 0.0625 * k
+        sample = state(x=5.0 + 0.4 * time_s, v=(0.4, 0.0, 0.0), time_s=time_s)
+        judged = ticks.judge(time_s, state=sample if k < 13 else None, scan=scan(ranges, time_s))
+    assert [notice.rule for notice in judged.notices] == ["scan_sector_masked"]
+    assert judged.scan is not None
+    assert np.flatnonzero(np.isnan(judged.scan.ranges_m)).tolist() == [90]
 
 
 def test_a_scan_that_is_no_scan_is_named_before_anything_is_asked_of_it():
@@ -284,6 +321,17 @@ def test_reset_forgets_times_and_scans():
     names = ("_now_s", "_state_time_s", "_scan_time_s", "_ranges", "_frozen", "_stuck", "_walled")
     assert [getattr(ticks.monitor, name) for name in names] == [-INF, -INF, -INF, None, 0, False, False]
     assert ticks.rules(1.0, state=state(x=9.0, time_s=1.0), scan=scan(None, 1.0, beams=30, sequence=1)) == []
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_reset_forgets_what_the_other_monitors_remember(reset):
+    """Another place, another geometry, after a pause: three faults in the same flight, none in a new one."""
+    ticks = Ticks()
+    ticks.judge(1.0)
+    if reset:
+        ticks.monitor.reset()
+    found = ticks.rules(1.5, state=state(x=9.0, time_s=1.5), scan=scan(None, 1.5, beams=30))
+    assert found == ([] if reset else ["tick_gap", "estimate_jump", "scan_source"])
 
 
 def test_the_commands_sent_decide_whether_an_estimate_may_stand_still():
