@@ -101,6 +101,14 @@ def test_in_space_never_seen_the_return_speed_holds():
     assert Shield(C)._speed_limit(around, 9.0, 9.0) == 0.3
 
 
+@pytest.mark.parametrize(("away_m", "in_the_open"), [(0.75, True), (0.735, False), (0.5, False), (0.1, False)])
+def test_a_point_is_as_far_from_the_open_as_its_extra_and_all_that_is_kept(away_m, in_the_open):
+    """0.3 m more than 0.4 m of keep-out and 0.05 m/s for 0.85 s: 0.7425 m from a box of one millionth."""
+    shield, around = Shield(C), surroundings([(-away_m, 0.0)], [0.3])
+    room = shield._guard.here(around.position)
+    assert shield._in_the_open(CorridorVector(0.0, 0.0, 0.0), around, room) == in_the_open
+
+
 # clearances of tubes
 
 
@@ -251,6 +259,16 @@ def test_pushed_candidates_follow_with_the_push_once_and_half_as_much_again(push
     assert found == pytest.approx(np.concatenate((plain, plain + moved, plain + 1.5 * moved)))
 
 
+def test_there_are_as_many_candidates_as_scales_and_shares_say(monkeypatch):
+    """An odd number of shorter ones; three shares of sliding for each model."""
+    monkeypatch.setattr("safety.shield.OUTWARD", (0.0, 0.1, 0.2))
+    shield, around = Shield(C), surroundings([(1.0, 0.5)], [0.1])
+    shield._scaled = shield._scaled[:5]
+    found = shield._candidates(WANTED, around, allowed())
+    assert found.shape == (5 + 3 + 6, 3)
+    assert found[4:8] == pytest.approx(np.array([0.1 * WANTED * (1, 1, 10), WANTED, (0.0, 0.0, 0.125), (0.0, 0.0, 0.0)]))
+
+
 # reasons
 
 
@@ -265,6 +283,7 @@ LEAST = 1e-9
 def test_each_rule_is_told_at_its_worst_place():
     assert reasons(allowed(clear=(0.0, 0.1, 0.2)), clear=(0.3, 0.05, 0.1)) == [("obstacle", 0.1, 0.2)]
     assert reasons(allowed(fence=(0.0, -0.1, -0.3)), fence=(0.2, -0.2, -0.35)) == [("fence", -0.2, -0.1)]
+    assert reasons(allowed(clear=(3.0, 0.3)), clear=(2.0, 0.2)) == [("obstacle", 2.0, 3.0)]
     both = reasons(allowed(clear=(0.0,), fence=(0.0, 0.0)), clear=(-0.5,), fence=(-0.1, -0.2))
     assert both == [("fence", -0.2, 0.0), ("obstacle", -0.5, 0.0)]
     assert reasons(allowed(clear=(0.0,)), clear=(0.0,)) == []
@@ -276,26 +295,16 @@ def test_a_reason_needs_more_than_rounding():
     assert reasons(allowed(), fence=(0.5, -1.1 * LEAST)) == [("fence", -1.1 * LEAST, 0.0)]
 
 
-@pytest.mark.parametrize(
-    ("climb", "told"), [(0.25, False), (0.25 + 2.0 * LEAST, True), (-0.5, False), (-0.5 - 2.0 * LEAST, True)]
-)
+@pytest.mark.parametrize(("climb", "told"), [(LEAST, False), (1.1 * LEAST, True), (-0.5, False), (-0.5 - 2.0 * LEAST, True)])
 def test_climbing_or_sinking_further_than_allowed_is_told_as_the_fence(climb, told):
-    found = reasons(allowed(sink=-0.5, climb=0.25), (0.0, 0.0, climb), fence=(0.4, 0.3))
+    found = reasons(allowed(sink=-0.5, climb=0.0), (0.0, 0.0, climb), fence=(0.4, 0.3))
     assert found == ([("fence", 0.3, 0.0)] if told else [])
 
 
-@pytest.mark.parametrize(("due", "told"), [(0.3, False), (0.3 + 0.5 * LEAST, False), (0.3 + 2.0 * LEAST, True), (0.5, True)])
-def test_what_a_command_lacks_of_the_way_out_is_told(due, told):
-    """0.3 m/s along the direction asked for; a second direction asks for less."""
-    held = Allowance(
-        np.empty(0),
-        np.zeros(2),
-        np.array([[1.0, 0.0], [0.0, 1.0]]),
-        np.array([due, 0.0]),
-        np.zeros(2),
-        -0.5,
-        0.5,
-        np.zeros((2, 3)),
-    )
-    found = reasons(held, (0.3, 0.4, 0.0))
-    assert found == ([("hold_off", pytest.approx(due - 0.3), 0.0)] if told else [])
+@pytest.mark.parametrize(("due", "lacking"), [(0.3, 0.0), (LEAST, LEAST), (1.1 * LEAST, 1.1 * LEAST), (0.5, 0.5)])
+def test_what_a_command_lacks_of_the_way_out_is_told(due, lacking):
+    """Along x so much is asked for; along y less than the command does. More than rounding must be lacking."""
+    normals, asked = np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([due, 0.0])
+    held = Allowance(np.empty(0), np.zeros(2), normals, asked, np.zeros(2), -0.5, 0.5, np.zeros((2, 3)))
+    found = reasons(held, (due - lacking, 0.4, 0.0))
+    assert found == ([("hold_off", lacking, 0.0)] if lacking > LEAST else [])
