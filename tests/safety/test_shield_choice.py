@@ -244,15 +244,17 @@ SPIKE = ((15.0, 0.0), (14.8, -1.5), (15.2, -1.5))
 
 @pytest.mark.parametrize("turn", [0, 1, 2])
 def test_a_lone_vertex_beside_the_way_of_braking_presses(turn):
-    """0.3 m of braking past the tip of a spike, 0.545 m beside it: 5 mm too near in its middle, 1.5 cm clear at both ends."""
+    """Past the tip of a spike, 0.6 m beside it: a corner keeps 0.35 + 0.2 sqrt(2) = 0.633 m, the edges that meet there 0.574 m."""
     ring = SPIKE[turn:] + SPIKE[:turn]
     spiked = config(
         fence=Fence(floor_m=0.4, ceiling_m=3.2, inclusion=((9.0, -4.0), (21.0, -4.0), (21.0, 4.0), (9.0, 4.0)), exclusion=(ring,))
     )
-    around = standing(15.0, 0.545)
-    flying = Start(np.array([(14.85, 0.545, 1.8)] * 2), np.array([(0.5, 0.0, 0.0)] * 2))
+    around = standing(15.0, 0.6)
+    flying = Start(np.array([(14.85, 0.6, 1.8)] * 2), np.array([(0.5, 0.0, 0.0)] * 2))
     passing = Surroundings(around.x_m, around.y_m, around.extra_m, around.view, around.position, flying)
-    assert judged(passing, (0.5, 0.0, 0.0), c=spiked)[0].ways is not None
+    bounds, _, rooms = judged(passing, (0.5, 0.0, 0.0), c=spiked)
+    assert np.count_nonzero(rooms < 0.0) == 1
+    assert bounds.ways is not None
 
 
 def near_to(value: float) -> list[float]:
