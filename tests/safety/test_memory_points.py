@@ -10,7 +10,7 @@ import pytest
 from safety_plant import config, scan, state
 
 from safety.lidar import BeamTable, SeenScan, see
-from safety.memory import CAPACITY, ObstacleMemory
+from safety.memory import CAPACITY, ObstacleMemory, _edges
 
 C = config(memory_s=1.0, memory_hold_s=0.25)
 Point = tuple[float, float, float, float]  # x, y, spread, time of sight
@@ -154,6 +154,11 @@ def test_a_direction_belongs_to_the_nearest_beam(bearing_rad, saw_m):
     seen = replace(ALONG, range_m=np.array([1.0, 2.0, 3.0]), yaw_rad=7.0)
     reach = ObstacleMemory._reach(seen, np.array([bearing_rad + 7.0]))
     assert reach.tolist() == pytest.approx([math.nan if saw_m is None else saw_m], nan_ok=True)
+
+
+def test_a_beam_that_saw_exactly_as_much_further_as_the_same_thing_may_is_no_edge():
+    assert _edges(np.array([0.4, 0.2, 0.4])).tolist() == [False] * 3
+    assert _edges(np.array([0.4, math.nextafter(0.2, 0.0), 0.4])).tolist() == [False, True, False]
 
 
 def test_a_near_return_has_its_far_side_no_further_than_twice_as_far():

@@ -244,7 +244,7 @@ SPIKE = ((15.0, 0.0), (14.8, -1.5), (15.2, -1.5))
 
 @pytest.mark.parametrize("turn", [0, 1, 2])
 def test_a_lone_vertex_beside_the_way_of_braking_presses(turn):
-    """Past the tip of a spike, 0.6 m beside it: a corner keeps 0.35 + 0.2 sqrt(2) = 0.633 m, the edges that meet there 0.574 m."""
+    """Past the tip of a spike, 0.6 m beside it: a corner keeps 0.35 + 0.2 sqrt(2) = 0.633 m, its edges 0.574 m."""
     ring = SPIKE[turn:] + SPIKE[:turn]
     spiked = config(
         fence=Fence(floor_m=0.4, ceiling_m=3.2, inclusion=((9.0, -4.0), (21.0, -4.0), (21.0, 4.0), (9.0, 4.0)), exclusion=(ring,))
