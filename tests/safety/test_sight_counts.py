@@ -34,7 +34,7 @@ def random_view(chance: np.random.Generator, unseen: float) -> View:
 
 def random_tubes(chance: np.random.Generator, count: int) -> Tubes:
     """High up: a height that is taken for a place sideways is noticed."""
-    turn = chance.uniform(-1.5, 1.5, (2, count, 3)) + (0.0, 0.0, 40.0)
+    turn = chance.uniform(-1.5, 1.5, (2, count, 3)) + np.array((0.0, 0.0, 40.0))
     return Tubes(turn, turn + chance.uniform(-1.2, 1.2, (2, count, 3)))
 
 
