@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from pickle import UnpicklingError  # what torch.load raises on a file that is not plain data
 from typing import Any
@@ -17,6 +20,17 @@ RESUME_KEYS = ("optimizer", "resume")
 
 class CheckpointError(Exception):
     """A checkpoint that cannot be used; the message says which file and why."""
+
+
+@contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Nobody else trains in the folder during the block. The lock ends with the process. Raises CheckpointError."""
+    with (folder / "writer.lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise CheckpointError(f"{folder}: another process trains there; wait for it, or give another --out") from None
+        yield
 
 
 def save_checkpoint(path: Path, content: dict[str, Any]) -> None:

@@ -6,7 +6,7 @@ import subprocess
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import torch
 
 from policy_export.contract import ActionLayout, ObservationLayout, default_layout, paper_layout
 from policy_export.network import NetworkConfig, PolicyNetwork
-from training.checkpoint import CheckpointError, load_checkpoint, load_plain, save_checkpoint, to_plain
+from training.checkpoint import CheckpointError, load_checkpoint, load_plain, only_writer, save_checkpoint, to_plain
 from training.config import PpoConfig, TrainingConfig
 from training.environment import CorridorVectorEnv
 from training.evaluation import evaluate, evaluation_environment
@@ -82,9 +82,16 @@ class Trainer:
         return min(1.0, self.decisions / self.config.decisions)
 
     def updates(self) -> Iterator[Status]:
-        """Train until ``config.decisions`` are done. Raises TrainingDivergedError with the last checkpoint intact."""
+        """Train until ``config.decisions`` are done.
+
+        Raises TrainingDivergedError with the last checkpoint intact, CheckpointError where another process trains in the folder.
+        """
         self.out.mkdir(parents=True, exist_ok=True)
-        with Recorder(self.out, self.decisions) if self.team.leads else nullcontext() as recorder:
+        with ExitStack() as stack:
+            recorder = None
+            if self.team.leads:
+                stack.enter_context(only_writer(self.out))
+                recorder = stack.enter_context(Recorder(self.out, self.decisions))
             while self.decisions < self.config.decisions:
                 status = self._one_update()
                 if recorder is not None:

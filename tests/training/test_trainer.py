@@ -345,7 +345,7 @@ def last_decisions(metrics):
     return json.loads(lines[-1])["decisions"] if lines else 0
 
 
-def test_killed_run_goes_on_and_a_terminated_one_saves(tmp_path):
+def test_killed_run_goes_on_alone_and_a_terminated_one_saves(tmp_path):
     preset = write_preset(
         tmp_path / "long.yaml", decisions=10_000_000, checkpoint_every_updates=1, evaluation={"every_decisions": 10_000_000}
     )
@@ -363,6 +363,9 @@ def test_killed_run_goes_on_and_a_terminated_one_saves(tmp_path):
         assert time.monotonic() < end
         assert process.poll() is None
         time.sleep(0.05)
+    _, refused = (second := start(["--resume", str(out)])).communicate(timeout=60)
+    assert second.returncode == 2
+    assert "another process trains there" in refused
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 0
