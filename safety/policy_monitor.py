@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass
 
 from safety.config import SafetyConfig
+from safety.frames import CorridorVector
 from safety.messages import Health, Intervention, VelocityCommand
 
 BAD_WITHIN_S = 1.0
 FULL = 0.99  # share of a limit that counts as being at it
 ROUNDING_S = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class _Swing:
+    """The last command, how it differed from the one before (m/s), and how many times in a row that was a turning back."""
+
+    velocity: CorridorVector
+    step: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turns: int = 0
 
 
 class PolicyMonitor:
@@ -24,9 +35,7 @@ class PolicyMonitor:
     def reset(self) -> None:
         """Forget earlier commands."""
         self._full_since_s: float | None = None
-        self._last: VelocityCommand | None = None
-        self._step = (0.0, 0.0, 0.0)
-        self._turns = 0
+        self._swing: _Swing | None = None
         self._bad.clear()
 
     def judge_memory(self, health: Health, found: list[Intervention]) -> None:
@@ -40,15 +49,14 @@ class PolicyMonitor:
     def judge_bad(self, now_s: float, found: list[Intervention]) -> None:
         """P1: once more no usable command although the samples were good."""
         self._bad.append(now_s)
-        self._last, self._turns, self._full_since_s = None, 0, None
+        self._swing, self._full_since_s = None, None
         if len(self._bad) == self._config.bad_commands and now_s - self._bad[0] <= BAD_WITHIN_S:
             found.append(Intervention("command_bad_again", float(len(self._bad)), float(self._config.bad_commands)))
 
     def judge(self, command: VelocityCommand, now_s: float, notices: list[Intervention]) -> None:
         """P2, P10: a finite command; only told, the limits alone keep it safe."""
         self._judge_saturation(command, now_s, notices)
-        self._judge_oscillation(command, notices)
-        self._last = command
+        self._judge_oscillation(command.velocity, notices)
 
     def _judge_saturation(self, command: VelocityCommand, now_s: float, notices: list[Intervention]) -> None:
         v, limits = command.velocity, self._limits
@@ -64,15 +72,15 @@ class PolicyMonitor:
         if now_s - self._full_since_s >= self._config.saturated_s - ROUNDING_S:
             notices.append(Intervention("policy_saturated", now_s - self._full_since_s, self._config.saturated_s))
 
-    def _judge_oscillation(self, command: VelocityCommand, notices: list[Intervention]) -> None:
+    def _judge_oscillation(self, velocity: CorridorVector, notices: list[Intervention]) -> None:
         """Steps of the command that turn back at every tick: half the sampling rate."""
-        if self._last is None:
-            self._step, self._turns = (0.0, 0.0, 0.0), 0
+        if (last := self._swing) is None:
+            self._swing = _Swing(velocity)
             return
-        a, b, before = self._last.velocity, command.velocity, self._step
+        a, b, before = last.velocity, velocity, last.step
         step = (b.x - a.x, b.y - a.y, b.z - a.z)
-        self._step = step
         back = step[0] * before[0] + step[1] * before[1] + step[2] * before[2] < 0.0
-        self._turns = self._turns + 1 if back and math.hypot(*step) > self._config.oscillation_m_s else 0
-        if self._turns >= self._config.oscillation_ticks:
-            notices.append(Intervention("policy_oscillating", float(self._turns), float(self._config.oscillation_ticks)))
+        turns = last.turns + 1 if back and math.hypot(*step) > self._config.oscillation_m_s else 0
+        self._swing = _Swing(velocity, step, turns)
+        if turns >= self._config.oscillation_ticks:
+            notices.append(Intervention("policy_oscillating", float(turns), float(self._config.oscillation_ticks)))
