@@ -20,13 +20,14 @@ def strength(results: dict[str, dict[str, Any]]) -> str:
 def mutation(result: dict[str, Any]) -> str:
     """The score per file, and what is not killed."""
     real = result["mutants"] - result["only_annotations"] - result["not_run"]
+    left = f"{result['not_run']:,} were not run (those that were are chosen at random), " if result["not_run"] else ""
     text = (
-        f"`{result['command']}`: cosmic-ray {result['cosmic_ray']} makes {result['mutants']} mutants. {result['not_run']} were "
-        f"not run, {result['only_annotations']} change annotations that never run. Of the other {real}, chosen at random where "
-        f"not all were run, {result['killed']} are killed ({100 * result['score']:.2f} %), {result['proved_equivalent']} are "
-        f"proved equivalent one by one ({100 * result['equivalent_share']:.2f} %, `tests/safety/equivalent_mutants.json`), "
+        f"`{result['command']}`: cosmic-ray {result['cosmic_ray']} makes {result['mutants']:,} mutants. {left}"
+        f"{result['only_annotations']} change annotations that never run. Of the other {real:,}, {result['killed']:,} are killed "
+        f"({100 * result['score']:.2f} %), {result['proved_equivalent']} are proved equivalent one by one "
+        f"({100 * result['equivalent_share']:.2f} %, `tests/safety/equivalent_mutants.json`), "
         f"{result['unexplained']} survive unexplained ({result['timeout']} of them ran out of time, which is no kill). "
-        f"{result['tests']} tests, {result['properties']} of them properties of hypothesis."
+        f"{result['tests']:,} tests, {result['properties']} of them properties of hypothesis."
     )
     rows = [f"| `{path}` | {_row(counts)} |" for path, counts in result["files"].items()]
     return "\n".join(
