@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -27,13 +26,13 @@ class Run:
         return self.folder / "policy.onnx"
 
 
-def study_runs(algorithms: dict[str, TrainingConfig], seeds: int, decisions: int | None, folder: Path) -> list[Run]:
-    """Every algorithm from seeds 1 to ``seeds``; ``decisions`` replaces the presets' training volume."""
+def study_runs(algorithms: dict[str, TrainingConfig], seeds: int, decisions: int, folder: Path) -> list[Run]:
+    """Every algorithm from seeds 1 to ``seeds``; each for so many ``decisions``."""
     runs = []
     for seed in range(1, seeds + 1):
         for name, preset in algorithms.items():
-            change: dict[str, Any] = {"seed": seed} | ({} if decisions is None else {"decisions": decisions})
-            runs.append(Run(name, preset.model_copy(update=change), folder / f"{name.lower()}-{seed}"))
+            config = preset.model_copy(update={"seed": seed, "decisions": decisions})
+            runs.append(Run(name, config, folder / f"{name.lower()}-{seed}"))
     return runs
 
 

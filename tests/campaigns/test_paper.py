@@ -40,6 +40,7 @@ def test_a_tiny_study_writes_everything_and_keeps_what_is_finished(tmp_path, mon
     monkeypatch.chdir(ROOT)
     arguments = ["--ppo", preset(tmp_path, "none"), "--lstm", preset(tmp_path, "lstm"), "--seeds", "2", "--episodes", "1"]
     arguments += ["--workers", "1", "--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
+    arguments += ["--decisions", str(3 * UPDATE)]
     assert main(arguments) == 0
     out = tmp_path / "out"
     for name in FIGURES:
@@ -62,13 +63,13 @@ def test_a_tiny_study_writes_everything_and_keeps_what_is_finished(tmp_path, mon
 
 def test_a_folder_with_another_configuration_is_refused(tmp_path):
     config = TrainingConfig.model_validate(yaml.safe_load(Path(preset(tmp_path, "none")).read_text()))
-    (run,) = study_runs({"PPO": config}, 1, None, tmp_path / "runs")
+    (run,) = study_runs({"PPO": config}, 1, 3 * UPDATE, tmp_path / "runs")
     assert finished_decisions(run) == 0
     from training.trainer import Trainer
 
     list(Trainer(run.config, run.folder).updates())
     assert finished_decisions(run) == 3 * UPDATE
-    other = study_runs({"PPO": config.model_copy(update={"memory": "lstm"})}, 1, None, tmp_path / "runs")[0]
+    other = study_runs({"PPO": config.model_copy(update={"memory": "lstm"})}, 1, 3 * UPDATE, tmp_path / "runs")[0]
     with pytest.raises(CheckpointError, match="another configuration"):
         finished_decisions(other)
 
